@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
@@ -25,6 +26,15 @@ from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, PITCHYAW, RELEASE, UNCHANGED, pitchyaw_parameters
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.mode_changes import (
+    ARM_DISARM,
+    DO_SET_MODE,
+    MODE_FLAG_CUSTOM,
+    NAV_TAKEOFF,
+    Ending,
+    ModeChange,
+    ModeChanges,
+)
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import Event, EventCatalogue
 from companion.vehicle.setpoint import Setpoint, setpoint_fields
@@ -40,6 +50,8 @@ from mavlink_sim.wire.messages import dialect
 from vision.obstacle_sectors import ObstacleSectors
 
 START_NS = 1_000_000_000_000
+# As the drivers send it, and keep what was sent.
+TIMESYNC_PERIOD_NS, TIMESYNCS_KEPT = 500_000_000, 8
 # As the drivers wait.
 SHOWN_TIMEOUT_S = 3.0
 GIMBAL_INFORMATION_ID = 280
@@ -115,7 +127,14 @@ class SimulatedDriver:
         self._kind = ARDUPILOT if copter else PX4
         self._profile: AutopilotProfile = ArduPilotProfile() if copter else Px4Profile()
         self._state = VehicleState(autopilot=self._profile.name, range_finder_height=range_finder_height)
-        self._mode_ns = 0
+        self._changes = ModeChanges(
+            lambda command, values, confirmation: self.vehicle.send(self._long(command, *values)),
+            self._profile.mode_parameters,
+            self._on_restored,
+        )
+        self._changing: dict[int, ModeChange] = {}
+        self._timesyncs_ns: deque[int] = deque(maxlen=TIMESYNCS_KEPT)
+        self._answered_ns = 0
         self._pending: list[_Pending] = []
         self._answers: list[Answer] = []
         if vehicle.vehicle.gimbal is not None:
@@ -163,22 +182,11 @@ class SimulatedDriver:
         mav, state = dialect, self._state
         match request.action:
             case SetMode(mode):
-                asked_ns = self.now_ns
-                shown_mode, main, sub = self._profile.mode_request(mode, state)
-                self._command(
-                    request,
-                    f"the vehicle refused mode {mode}",
-                    lambda: self._mode_ns > asked_ns and self._state.mode is shown_mode,
-                    mav.MAV_CMD_DO_SET_MODE,
-                    1.0,
-                    main,
-                    sub,
-                )
+                number = self._profile.mode_request(mode, state)
+                parameters = (MODE_FLAG_CUSTOM, *self._profile.mode_parameters(number))
+                self._change(request, ModeChange(f"mode {mode}", DO_SET_MODE, parameters, state, number))
             case Arm():
-                failure = "the vehicle refused to arm"
-                self._command(
-                    request, failure, lambda: self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0
-                )
+                self._change(request, ModeChange("arming", ARM_DISARM, (1.0,), state, None, True))
             case Disarm():
                 failure = "the vehicle refused to disarm"
                 self._command(
@@ -194,9 +202,9 @@ class SimulatedDriver:
                 except CommandRefusedError as error:
                     self._answers.append(Answer(request.identifier, str(error)))
                     return
-                self._command(
-                    request, "the vehicle refused to take off", None, mav.MAV_CMD_NAV_TAKEOFF, *values
-                )
+                change = ModeChange("take-off", NAV_TAKEOFF, values, state, self._profile.takeoff_mode())
+                change.done_by_acknowledgement = True
+                self._change(request, change)
             case FindGimbal():
                 self._command(
                     request,
@@ -217,7 +225,16 @@ class SimulatedDriver:
                     request, "the vehicle refused to give the gimbal back", None, CONFIGURE, *values
                 )
 
+    def _change(self, request: Request, change: ModeChange) -> None:
+        self._changing[request.identifier] = change
+        self._changes.begin(change, self._state, self.now_ns)
+
+    def _on_restored(self, _change: ModeChange, text: str) -> None:
+        self._state = replace(self._state, mode_restored=text)
+
     def cancel(self, identifier: int) -> None:
+        if identifier in self._changing:
+            self._changes.drop(self._changing.pop(identifier), "cancelled")
         self._pending = [pending for pending in self._pending if pending.identifier != identifier]
 
     def take_answers(self) -> tuple[Answer, ...]:
@@ -235,18 +252,41 @@ class SimulatedDriver:
             name = message.get_type()
             if name == "COMMAND_ACK":
                 self._acknowledge(message)
+                self._changes.on_acknowledgement(message.command, message.result, now_ns)
+            elif name == "TIMESYNC" and message.tc1 > 0 and message.ts1 in self._timesyncs_ns:
+                self._answered_ns = max(self._answered_ns, message.ts1)
             elif name == "EVENT":
                 self._on_event(message, now_ns)
             elif name in TELEMETRY_MESSAGES or self._kind == ARDUPILOT:
                 for name_now, fields in self._profile.translate(name, message.to_dict(), self._state):
-                    if name_now in ("HEARTBEAT", "CURRENT_MODE"):
-                        self._mode_ns = now_ns
                     self._state = apply_message(self._state, name_now, fields, now_ns)
+                    if name_now in ("HEARTBEAT", "CURRENT_MODE"):
+                        self._changes.on_report(self._state, now_ns)
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)
             elif now_ns > pending.until_ns:
                 self._answer(pending, f"{pending.failure}: nothing shows after {SHOWN_TIMEOUT_S:g} s")
+
+        self._follow_changes(now_ns)
+
+    def _follow_changes(self, now_ns: int) -> None:
+        """As `flight_commands` follows them, with a TIMESYNC every half second meanwhile."""
+        if not self._changing and not self._changes.pending:
+            return
+        if not self._timesyncs_ns or now_ns - self._timesyncs_ns[-1] >= TIMESYNC_PERIOD_NS:
+            self._timesyncs_ns.append(now_ns)
+            self.vehicle.send(dialect.MAVLink_timesync_message(0, now_ns))
+        self._changes.tick(now_ns, self._answered_ns)
+        for identifier, change in list(self._changing.items()):
+            if change.ending is None:
+                continue
+            del self._changing[identifier]
+            refused = None if change.ending is Ending.DONE else change.why
+            self._answers.append(Answer(identifier, refused, change.ending is Ending.TAKEN_OVER))
+            if change.command == NAV_TAKEOFF and refused is None:
+                for name, fields in self._profile.on_takeoff_accepted():
+                    self._state = apply_message(self._state, name, fields, now_ns)
 
     def _on_event(self, message: Any, now_ns: int) -> None:
         event = Event(message.id, message.sequence, message.log_levels, message.arguments)

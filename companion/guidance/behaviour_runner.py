@@ -280,7 +280,10 @@ class BehaviourRunner:
     def _take_answer(self, answer: Answer, context: BehaviourContext) -> None:
         """Handle the answer to the pending request."""
         engaging = self._modes.phase is Phase.ENGAGING
-        if (why := self._modes.take_answer(answer, context.now_ns)) is not None:
+        if answer.taken_over and answer.refused is not None:
+            # Where that change no longer shows, our message has arrived after it; the driver undoes that.
+            self._lose(answer.refused)
+        elif (why := self._modes.take_answer(answer, context.now_ns)) is not None:
             self._request_failed(why, context)
         elif engaging and self._modes.phase is Phase.OFFBOARD:
             self._stepped_ns = None

@@ -81,10 +81,15 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The result of a request. `refused` is the reason in words; None: it was done."""
+    """The result of a request. `refused` is the reason in words; None: it was done.
+
+    `taken_over`: the reason is a change of mode or arming by someone else, or by the autopilot itself. It may
+    no longer show.
+    """
 
     identifier: int
     refused: str | None = None
+    taken_over: bool = False
 
 
 @dataclass(frozen=True, slots=True)

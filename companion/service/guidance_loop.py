@@ -13,12 +13,13 @@ from typing import Any
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput, StreamStatus
+from companion.guidance.mode_control import Phase
 from companion.recording.guidance_record import StepContext
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
-from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import Streamer, StreamState
 
@@ -98,15 +99,28 @@ class GuidanceLoop:
             await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
 
     async def shut_down(self) -> None:
-        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
-        flying = self._streamer.state is not StreamState.SILENT
+        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD.
+
+        Nothing is requested in another mode, which is a pilot's or the autopilot's. Where OFFBOARD is under
+        way, the mode that shows is requested, so that it remains.
+        """
+        state, mode = self._driver.state, None
+        if self._streamer.state is not StreamState.SILENT:
+            engaging = self.guidance.phase is Phase.ENGAGING
+            if state.mode is FlightMode.OFFBOARD or (engaging and state.mode is FlightMode.TAKEOFF):
+                mode = FlightMode.HOLD
+            elif engaging and state.mode is not FlightMode.UNKNOWN:
+                mode = state.mode
         try:
             self.begin_shutdown()
         finally:
             self._streamer.stop()
             try:
-                if flying and self._driver.state.connected(time.monotonic_ns()):
-                    await self._driver.set_mode(FlightMode.HOLD, timeout_s=2.0)
+                if mode is not None and self._driver.state.connected(time.monotonic_ns()):
+                    await self._driver.set_mode(mode, timeout_s=2.0, since=state)
+            except TakenOverError as error:
+                self._on_event("warning", f"shutdown: {error}")
+                await self._driver.settle()
             except CommandRefusedError as error:
                 self._on_event("error", f"shutdown: {error}; {self._driver.state.without_setpoints}")
             finally:

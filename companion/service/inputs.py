@@ -84,6 +84,10 @@ class InputAssembler:
         """Process a new snapshot of the vehicle."""
         if state.reports is not self._reported:
             self._log_reports(state)
+        if state.mode_restored and (
+            self._state is None or state.mode_restored is not self._state.mode_restored
+        ):
+            self._on_event("warning", state.mode_restored)
         if (state.mode, state.armed) != self._shown:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1

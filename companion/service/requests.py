@@ -21,8 +21,9 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.tasks import spawn
-from companion.vehicle.driver import CommandRefusedError, Driver, LinkError
+from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, TakenOverError
 from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 from vision.obstacle_sectors import ObstacleSectors
 from vision.path_planner import PathRequest
@@ -72,7 +73,8 @@ class RequestRunner:
 
     def start(self, request: Request) -> None:
         """Start a request."""
-        task = spawn(self._run(request), f"request {request.action}")
+        # The state of the step that has decided it: a report may come before the task begins.
+        task = spawn(self._run(request, self._driver.state), f"request {request.action}")
         self._tasks[request.identifier] = task
         task.add_done_callback(lambda done: self._on_done(request.identifier, done))
 
@@ -103,29 +105,31 @@ class RequestRunner:
             self.cancel(identifier)
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _run(self, request: Request) -> None:
+    async def _run(self, request: Request, since: VehicleState) -> None:
         refused: str | None = None
+        taken_over = False
         try:
-            refused = await self._execute(request.action)
+            refused = await self._execute(request.action, since)
         except (CommandRefusedError, LinkError) as error:
             refused = str(error) or type(error).__name__
+            taken_over = isinstance(error, TakenOverError)
         except Exception as error:
             # Without an answer guidance would wait forever.
             logger.exception("%s: request failed", request.action)
             refused = f"{type(error).__name__}: {error}"
-        self._answers.append(Answer(request.identifier, refused))
+        self._answers.append(Answer(request.identifier, refused, taken_over))
         self._on_answer()
 
-    async def _execute(self, action: Action) -> str | None:
+    async def _execute(self, action: Action, since: VehicleState) -> str | None:
         match action:
             case SetMode(mode):
-                await self._driver.set_mode(mode)
+                await self._driver.set_mode(mode, since=since)
             case Arm():
-                await self._driver.arm()
+                await self._driver.arm(since=since)
             case Disarm():
                 await self._driver.disarm()
             case TakeOff(altitude_m):
-                await self._driver.takeoff(altitude_m)
+                await self._driver.takeoff(altitude_m, since=since)
             case FindGimbal():
                 return None if await self._driver.find_gimbal() else "gimbal manager not responding"
             case TakeGimbal():

@@ -140,12 +140,15 @@ class ArduPilotProfile(AutopilotProfile):
             "z": (origin["altitude"] - home["altitude"]) * 1e-3,
         }
 
-    def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
+    def mode_request(self, mode: FlightMode, state: VehicleState) -> int:
         flying = state.armed and state.landed is not LandedState.ON_GROUND
         if mode is FlightMode.OFFBOARD or (mode is FlightMode.HOLD and not flying):
             self._guided_use, self._seen_guided = mode, False
-            return mode, GUIDED, 0
-        return mode, custom_mode_of_mode(mode), 0
+            return GUIDED
+        return custom_mode_of_mode(mode)
+
+    def mode_parameters(self, custom_mode: int) -> tuple[int, int]:
+        return custom_mode, 0
 
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
         if not state.armed:

@@ -53,6 +53,8 @@ _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
+_COMMAND_ACK_ID = 77
+_COMMAND_ACK = struct.Struct("<HBBiBB")  # command, result, progress, result_param2, target system, component
 _NAMED_VALUE_INT_ID = 252
 _NAMED_VALUE_INT = struct.Struct("<II10s")  # time_boot_ms, value, name
 _TIMESYNC_ID = 111
@@ -61,6 +63,7 @@ _SYSTEM_TIME = struct.Struct("<QI")  # time_unix_usec, time_boot_ms
 _SETPOINT_ID = 84  # SET_POSITION_TARGET_LOCAL_NED
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
+_TIMESYNCS_KEPT = 8  # those of the last 4 s
 
 
 class AutopilotDriver(ABC):
@@ -88,7 +91,9 @@ class AutopilotDriver(ABC):
         self._own_component_id = own_component_id
         self._started_ns = time.monotonic_ns()
         self._telemetry = TelemetryState(url, self._warn_other_autopilot, range_finder_height)
-        self._flight_commands = FlightCommands(url, self._telemetry, self._command, self._ack_is_ours)
+        self._flight_commands = FlightCommands(
+            url, self._telemetry, self._command, self._send_once, self._ack_is_ours, self._no_answer
+        )
         self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command, self.own_address)
         self._command_locks: dict[int, asyncio.Lock] = {}
         self._link: ByteLink | None = None
@@ -102,6 +107,7 @@ class AutopilotDriver(ABC):
         self._source: Source = None
         self._newest_heartbeat: Frame | None = None
         self._timesync_sent_ns = 0
+        self._timesyncs_ns: deque[int] = deque(maxlen=_TIMESYNCS_KEPT)
         self._heartbeat_received = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
         self._time_sent_ns = 0
@@ -138,6 +144,10 @@ class AutopilotDriver(ABC):
     @abstractmethod
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         """Send one message."""
+
+    @abstractmethod
+    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        """Send one COMMAND_LONG, once. `parameters`: all seven."""
 
     @abstractmethod
     async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
@@ -198,6 +208,7 @@ class AutopilotDriver(ABC):
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
+        await self._flight_commands.close()
         try:
             await self._detach()
         finally:
@@ -259,6 +270,8 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == CURRENT_MODE_ID:
                         self._current_mode_from(frame)
                         continue
+                    elif frame.message_id == _COMMAND_ACK_ID:
+                        self._acknowledgement_from(frame)
                     elif self._reports.on_frame(frame):
                         continue
                 ours.append(frame)
@@ -315,6 +328,13 @@ class AutopilotDriver(ABC):
             fields = {"custom_mode": shown, "intended_custom_mode": intended}
             self._telemetry.handle("CURRENT_MODE", fields)
 
+    def _acknowledgement_from(self, frame: Frame) -> None:
+        """Apply a COMMAND_ACK here: its order among the reports of the mode counts (`mode_changes`)."""
+        if self._autopilot_kind in self.supported_autopilots:
+            command, result, *_, system, component = _COMMAND_ACK.unpack(frame.padded(_COMMAND_ACK.size))
+            target = {"target_system": system, "target_component": component}
+            self._telemetry.handle("COMMAND_ACK", {"command": command, "result": result, **target})
+
     def _commander_from(self, frame: Frame, mav_type: int, custom_mode: int) -> None:
         """Note another service on this vehicle, if the heartbeat is one's."""
         sender = (frame.system_id, frame.component_id)
@@ -336,6 +356,8 @@ class AutopilotDriver(ABC):
         boot_ns, sent_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
         # Older autopilots leave the target 0; our own stamp identifies the reply.
         for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
+        if boot_ns > 0 and for_us and sent_ns in self._timesyncs_ns:
+            self._telemetry.answered_ns = max(self._telemetry.answered_ns, sent_ns)
         if not (boot_ns > 0 and sent_ns == self._timesync_sent_ns and for_us):
             return
         self._telemetry.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
@@ -473,25 +495,48 @@ class AutopilotDriver(ABC):
         async with lock:
             return await self._exchange_command(command, (*parameters, *[0.0] * (7 - len(parameters))))
 
-    async def arm(self) -> None:
+    def _send_once(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        """Send a command that changes the mode: only `mode_changes` repeats it."""
+        if self._link is None:
+            raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
+        self._send_command(command, (*parameters, *[0.0] * (7 - len(parameters))), confirmation)
+
+    async def arm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
         """See Driver."""
         self._check_flown("arm")
-        await self._flight_commands.arm_or_disarm(True, self._system_id)
+        await self._flight_commands.arm_or_disarm(
+            True, self._system_id, since=since, valid_until_ns=valid_until_ns
+        )
 
     async def disarm(self) -> None:
         """See Driver."""
         self._check_flown("disarm")
         await self._flight_commands.arm_or_disarm(False, self._system_id)
 
-    async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
+    async def set_mode(
+        self,
+        mode: FlightMode,
+        *,
+        timeout_s: float = 3.0,
+        since: VehicleState | None = None,
+        valid_until_ns: int | None = None,
+    ) -> None:
         """See Driver."""
         self._check_flown(f"mode {mode}")
-        await self._flight_commands.set_mode(mode, timeout_s=timeout_s)
+        await self._flight_commands.set_mode(
+            mode, timeout_s=timeout_s, since=since, valid_until_ns=valid_until_ns
+        )
 
-    async def takeoff(self, altitude_m: float) -> None:
+    async def takeoff(
+        self, altitude_m: float, *, since: VehicleState | None = None, valid_until_ns: int | None = None
+    ) -> None:
         """See Driver."""
         self._check_flown("take-off")
-        await self._flight_commands.takeoff(altitude_m)
+        await self._flight_commands.takeoff(altitude_m, since=since, valid_until_ns=valid_until_ns)
+
+    async def settle(self) -> None:
+        """See Driver."""
+        await self._flight_commands.settled()
 
     @property
     def own_address(self) -> Address:
@@ -544,6 +589,7 @@ class AutopilotDriver(ABC):
         """Send TIMESYNC requests until cancelled."""
         while True:
             self._timesync_sent_ns = time.monotonic_ns()
+            self._timesyncs_ns.append(self._timesync_sent_ns)
             request = _TIMESYNC.pack(0, self._timesync_sent_ns, self._system_id or 0, AUTOPILOT_COMPONENT)
             self._transmit_payload(_TIMESYNC_ID, request)
             await asyncio.sleep(_TIMESYNC_PERIOD_S)

@@ -56,15 +56,20 @@ class AutopilotProfile(ABC):
         return [(name, fields)]
 
     @abstractmethod
-    def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
-        """Return the mode that will be reported, and DO_SET_MODE's parameters 2 and 3.
+    def mode_request(self, mode: FlightMode, state: VehicleState) -> int:
+        """Return the custom_mode to request for a mode. Raises ValueError if it cannot be requested."""
 
-        Raises ValueError for a mode that cannot be requested.
-        """
+    @abstractmethod
+    def mode_parameters(self, custom_mode: int) -> tuple[int, int]:
+        """Return DO_SET_MODE's parameters 2 and 3 for a custom_mode."""
 
     @abstractmethod
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
         """Return NAV_TAKEOFF's parameters for a height above home, metres. Raises CommandRefusedError."""
+
+    def takeoff_mode(self) -> int | None:
+        """Return the custom_mode of a take-off; None: it is none of its own."""
+        return None
 
     def on_takeoff_accepted(self) -> list[tuple[str, Fields]]:
         """Return the messages to apply after an accepted take-off."""
@@ -100,9 +105,15 @@ class Px4Profile(AutopilotProfile):
     expected_hz = MappingProxyType({CURRENT_MODE_ID: 2.0})  # PX4 repeats it every 0.5 s, not more often
     optional = (CURRENT_MODE_ID, ESTIMATOR_STATUS_ID, ODOMETRY_ID)  # PX4 has CURRENT_MODE since 1.15
 
-    def mode_request(self, mode: FlightMode, state: VehicleState) -> tuple[FlightMode, int, int]:
+    def mode_request(self, mode: FlightMode, state: VehicleState) -> int:
         main, sub = request_of_mode(mode)
-        return mode, main, sub
+        return main << 16 | sub << 24
+
+    def mode_parameters(self, custom_mode: int) -> tuple[int, int]:
+        return custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
+
+    def takeoff_mode(self) -> int:
+        return self.mode_request(FlightMode.TAKEOFF, VehicleState())
 
     def takeoff_parameters(self, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
         if state.home_altitude_amsl_m is None:

@@ -29,6 +29,10 @@ class CommandRefusedError(RuntimeError):
     """The vehicle refused a request or did not fulfil it in time. The message says what and why."""
 
 
+class TakenOverError(CommandRefusedError):
+    """Someone else, or the autopilot by itself, changed the mode or the arming during the request."""
+
+
 class NoAnswerError(CommandRefusedError):
     """The vehicle is connected and has not answered. The message gives a likely reason."""
 
@@ -72,24 +76,46 @@ class Driver(Protocol):
     def subscribe(self, callback: Callable[[VehicleState], None]) -> Callable[[], None]:
         """Call back in the loop with every new snapshot; returns a function that unsubscribes."""
 
-    async def arm(self) -> None:
-        """Arm, and return when the vehicle reports armed. Raises CommandRefusedError."""
+    async def arm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
+        """Arm, and return when the vehicle reports armed. Raises CommandRefusedError.
+
+        This, `disarm`, `set_mode` and `takeoff` are sent by one state machine (`mode_changes`), one at once:
+        a new one replaces the pending one, which raises CommandRefusedError. They raise TakenOverError as
+        soon as someone else's change of mode or arming is reported.
+
+        Args:
+            since: the state that it was decided on; with another mode or arming now, nothing is sent. None:
+                the present one.
+            valid_until_ns: nothing is sent after it, CLOCK_MONOTONIC; None: no limit.
+        """
 
     async def disarm(self) -> None:
         """Disarm (never forced in the air), and return when reported. Raises CommandRefusedError."""
 
-    async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
+    async def set_mode(
+        self,
+        mode: FlightMode,
+        *,
+        timeout_s: float = 3.0,
+        since: VehicleState | None = None,
+        valid_until_ns: int | None = None,
+    ) -> None:
         """Request a flight mode, and return when the vehicle REPORTS it (HEARTBEAT or CURRENT_MODE).
 
         The acknowledgement is not sufficient: PX4 >= 1.16 first acknowledges every DO_SET_MODE.
-        Raises CommandRefusedError with the mode that is reported instead.
+        Raises CommandRefusedError with the mode that is reported instead. Other arguments as `arm`.
         """
 
-    async def takeoff(self, altitude_m: float) -> None:
+    async def takeoff(
+        self, altitude_m: float, *, since: VehicleState | None = None, valid_until_ns: int | None = None
+    ) -> None:
         """Request the autopilot's own take-off to a height above home, metres. Arm before or after.
 
-        Raises CommandRefusedError, also when home's altitude is unknown.
+        Raises CommandRefusedError, also when home's altitude is unknown. Other arguments as `arm`.
         """
+
+    async def settle(self) -> None:
+        """Wait until no command of ours can change the mode after someone else has, for at most 3 s."""
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         """Send one SET_POSITION_TARGET_LOCAL_NED now. Never raises for a lost link."""

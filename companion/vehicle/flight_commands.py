@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import logging
 import math
 import time
 from collections.abc import Awaitable, Callable
 
 from companion.vehicle.autopilot_profile import HOME_POSITION_ID
-from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.mav_result import ACCEPTED, IN_PROGRESS, result_name
+from companion.vehicle.driver import CommandRefusedError, TakenOverError
+from companion.vehicle.mav_result import result_name
+from companion.vehicle.mode_changes import (
+    ARM_DISARM,
+    DO_SET_MODE,
+    MODE_FLAG_CUSTOM,
+    NAV_TAKEOFF,
+    SHOWN_TIMEOUT_S,
+    Ending,
+    ModeChange,
+    ModeChanges,
+)
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import words_of
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.telemetry import Fields
 from companion.vehicle.telemetry_state import TelemetryState
 
-_MODE_FLAG_CUSTOM = 1
-_DO_SET_MODE = 176
-_NAV_TAKEOFF = 22
-_COMPONENT_ARM_DISARM = 400
+logger = logging.getLogger(__name__)
+
 _REQUEST_MESSAGE = 512
 _RUN_PREARM_CHECKS = 401
 # How long to wait for the first report of a failing check, which a busy computer gets late, and then for the
 # others.
 _FIRST_REASON_S, _REASONS_S = 2.0, 0.5
-_SHOWN_TIMEOUT_S = 3.0  # HEARTBEAT is sent once a second
+_HOME_TIMEOUT_S = 3.0
+# Between two looks at the clock of a pending change.
+_TICK_S = 0.05
 
 
 class FlightCommands:
@@ -33,8 +45,11 @@ class FlightCommands:
 
     Args:
         url: of the link, for messages. telemetry: the autopilot's state.
-        command: sends one command with its parameters and returns the MAV_RESULT.
+        command: sends one command with its parameters, repeated until answered; returns the MAV_RESULT.
+        send: sends one command once: number, parameters, confirmation. Raises CommandRefusedError without a
+            link.
         ack_is_ours: whether a COMMAND_ACK with these fields is addressed to us.
+        no_answer: builds the error for a command without an answer.
     """
 
     def __init__(
@@ -42,23 +57,100 @@ class FlightCommands:
         url: object,
         telemetry: TelemetryState,
         command: Callable[..., Awaitable[int]],
+        send: Callable[[int, tuple[float, ...], int], None],
         ack_is_ours: Callable[[Fields], bool],
+        no_answer: Callable[[str], CommandRefusedError],
     ) -> None:
         self._url, self._telemetry = url, telemetry
-        self._command, self._ack_is_ours = command, ack_is_ours
+        self._command, self._ack_is_ours, self._no_answer = command, ack_is_ours, no_answer
+        self._changes = ModeChanges(
+            send, lambda custom_mode: telemetry.profile.mode_parameters(custom_mode), self._on_restored
+        )
+        self._pending: set[ModeChange] = set()
+        self._restoring: set[asyncio.Task[None]] = set()
+        telemetry.watch(self._watch)
 
-    async def arm_or_disarm(self, armed: bool, system_id: int | None) -> None:
+    def _watch(self, name: str, fields: Fields) -> None:
+        """Pass on what the vehicle sends, in its order of arrival."""
+        if name in ("HEARTBEAT", "CURRENT_MODE"):
+            self._changes.on_report(self._telemetry.state, time.monotonic_ns())
+        elif name == "COMMAND_ACK" and self._ack_is_ours(fields):
+            self._changes.on_acknowledgement(fields["command"], fields["result"], time.monotonic_ns())
+
+    async def close(self) -> None:
+        """End what is pending."""
+        for change in self._pending:
+            self._changes.drop(change, f"{self._url}: the link was closed before an answer was received")
+        for task in self._restoring:
+            task.cancel()
+        await asyncio.gather(*self._restoring, return_exceptions=True)
+
+    async def settled(self) -> None:
+        """Wait until no message of ours can arrive after another's change of the mode."""
+        telemetry = self._telemetry
+
+        def settled() -> bool:
+            return self._changes.settled(time.monotonic_ns(), telemetry.answered_ns)
+
+        while not await telemetry.until(settled, _TICK_S):
+            pass
+
+    def _on_restored(self, change: ModeChange, text: str) -> None:
+        """Our message has overridden a pilot's change, which is requested again."""
+        logger.warning("%s: %s", self._url, text)
+        self._telemetry.on_mode_restored(text)
+        task = asyncio.create_task(self._follow(change), name=f"mode of {self._url}")
+        self._restoring.add(task)
+        task.add_done_callback(self._restoring.discard)
+
+    async def _change(self, change: ModeChange) -> None:
+        """Request a change until it ends. Raises CommandRefusedError, except for a rejection."""
+        telemetry = self._telemetry
+        self._changes.begin(change, telemetry.state, time.monotonic_ns())
+        await self._follow(change)
+        if change.ending is Ending.NO_ANSWER:
+            raise self._no_answer(change.why)
+        if change.ending is Ending.TAKEN_OVER:
+            raise TakenOverError(change.why)
+        if change.ending in (Ending.DROPPED, Ending.NOT_SHOWN):
+            raise CommandRefusedError(change.why)
+
+    async def _follow(self, change: ModeChange) -> None:
+        """Let time pass for a change until it has ended."""
+        telemetry, boots = self._telemetry, self._telemetry.restart_count
+        self._pending.add(change)
+        try:
+            while not await telemetry.until(lambda: change.ending is not None, _TICK_S):
+                now_ns = time.monotonic_ns()
+                if telemetry.restart_count != boots or not telemetry.state.connected(now_ns):
+                    self._changes.drop(change, f"{change.what}: the autopilot has restarted or is silent")
+                self._changes.tick(now_ns, telemetry.answered_ns)
+        finally:
+            self._pending.discard(change)
+            self._changes.drop(change, f"{change.what} was cancelled")
+
+    async def arm_or_disarm(
+        self,
+        armed: bool,
+        system_id: int | None,
+        *,
+        since: VehicleState | None = None,
+        valid_until_ns: int | None = None,
+    ) -> None:
         """Arm or disarm, and return when the vehicle reports it. `system_id`: for messages."""
         telemetry = self._telemetry
-        word = "arm" if armed else "disarm"
         if armed and telemetry.two_autopilots(time.monotonic_ns()):
             raise CommandRefusedError(
                 f"{self._url}: two autopilots answer as system {system_id}: arming refused; "
                 "set a unique MAV_SYS_ID on each"
             )
         asked_ns = time.monotonic_ns()
-        result = await self._command(_COMPONENT_ARM_DISARM, 1.0 if armed else 0.0)
-        if result != ACCEPTED:
+        parameters = (1.0 if armed else 0.0,)
+        word = "arming" if armed else "disarming"
+        change = ModeChange(word, ARM_DISARM, parameters, since or telemetry.state, None, armed)
+        change.valid_until_ns = valid_until_ns
+        await self._change(change)
+        if change.result is not None:
             if not armed:
                 reason = f"it is {telemetry.state.landed.replace('_', ' ')}"
             elif checks := await self._failing_checks(asked_ns):
@@ -67,11 +159,7 @@ class FlightCommands:
                 reason = f"in mode {telemetry.state.mode}"
             else:
                 reason = f"its pre-arm checks fail in mode {telemetry.state.mode}"
-            raise CommandRefusedError(f"the vehicle refused to {word} ({result_name(result)}): {reason}")
-        if not await telemetry.until(lambda: telemetry.state.armed is armed, _SHOWN_TIMEOUT_S):
-            raise CommandRefusedError(
-                f"the vehicle accepted to {word} but did not report it within {_SHOWN_TIMEOUT_S:g} s"
-            )
+            raise CommandRefusedError(f"{change.why}: {reason}")
 
     async def _failing_checks(self, asked_ns: int) -> str:
         """Return the autopilot's texts of the failing pre-arm checks; empty if it reports none."""
@@ -94,57 +182,50 @@ class FlightCommands:
         failing = [report for report in reports if report.is_check]
         return words_of(failing or [report for report in reports if report.is_listed_check])
 
-    async def set_mode(self, mode: FlightMode, *, timeout_s: float = 3.0) -> None:
+    async def set_mode(
+        self,
+        mode: FlightMode,
+        *,
+        timeout_s: float = SHOWN_TIMEOUT_S,
+        since: VehicleState | None = None,
+        valid_until_ns: int | None = None,
+    ) -> None:
         """Request a mode, and return when the vehicle reports it."""
         telemetry = self._telemetry
-        shown_mode, main, sub = telemetry.profile.mode_request(mode, telemetry.state)
-        rejected: list[int] = []
-
-        def watch(name: str, fields: Fields) -> None:
-            # PX4 >= 1.16: the first acknowledgement always accepts, the second is the Commander's.
-            if name != "COMMAND_ACK" or fields["command"] != _DO_SET_MODE or not self._ack_is_ours(fields):
-                return
-            if fields["result"] not in (ACCEPTED, IN_PROGRESS):
-                rejected.append(fields["result"])
-
-        asked_ns = time.monotonic_ns()
-        deadline = time.monotonic() + timeout_s
-
-        def shown() -> bool:
-            return telemetry.mode_ns > asked_ns and telemetry.state.mode is shown_mode
-
-        async with telemetry.watching(watch):
-            result = await self._command(_DO_SET_MODE, _MODE_FLAG_CUSTOM, main, sub)
-            if result != ACCEPTED:
-                rejected.append(result)
-            await telemetry.until(lambda: bool(rejected) or shown(), max(deadline - time.monotonic(), 0.0))
-        if rejected:
+        custom_mode = telemetry.profile.mode_request(mode, telemetry.state)
+        parameters = (MODE_FLAG_CUSTOM, *telemetry.profile.mode_parameters(custom_mode))
+        before = since or telemetry.state
+        change = ModeChange(f"mode {mode}", DO_SET_MODE, parameters, before, custom_mode)
+        change.timeout_s, change.valid_until_ns = timeout_s, valid_until_ns
+        try:
+            await self._change(change)
+        except CommandRefusedError:
+            telemetry.profile.clear_request()
+            raise
+        if change.result is not None:
             telemetry.profile.clear_request()
             hint = " (is a setpoint stream running?)" if mode is FlightMode.OFFBOARD else ""
-            raise CommandRefusedError(
-                f"the vehicle refused mode {mode} ({result_name(rejected[0])}){hint}: "
-                f"its mode is {telemetry.state.mode}"
-            )
-        if not shown():
-            telemetry.profile.clear_request()
-            raise CommandRefusedError(
-                f"the vehicle did not enter mode {mode} within {timeout_s:g} s: "
-                f"its mode is {telemetry.state.mode}"
-            )
+            raise CommandRefusedError(f"{change.why}{hint}: its mode is {telemetry.state.mode}")
 
-    async def takeoff(self, altitude_m: float) -> None:
+    async def takeoff(
+        self, altitude_m: float, *, since: VehicleState | None = None, valid_until_ns: int | None = None
+    ) -> None:
         """Request the autopilot's own take-off to a height above home, metres."""
         telemetry = self._telemetry
+        before = since or telemetry.state
         if not (math.isfinite(altitude_m) and altitude_m > 0.0):
             raise CommandRefusedError(f"the take-off altitude must be above 0 m, got {altitude_m}")
         if telemetry.profile.takeoff_needs_home:
             await self._update_home()
-        result = await self._command(
-            _NAV_TAKEOFF, *telemetry.profile.takeoff_parameters(altitude_m, telemetry.state)
-        )
-        if result != ACCEPTED:
+        parameters = telemetry.profile.takeoff_parameters(altitude_m, telemetry.state)
+        mode = telemetry.profile.takeoff_mode()
+        change = ModeChange("take-off", NAV_TAKEOFF, parameters, before, mode, done_by_acknowledgement=True)
+        change.valid_until_ns = valid_until_ns
+        await self._change(change)
+        if change.result is not None:
+            result = result_name(change.result)
             raise CommandRefusedError(
-                f"the vehicle refused to take off ({result_name(result)}) in mode {telemetry.state.mode}"
+                f"the vehicle refused to take off ({result}) in mode {telemetry.state.mode}"
             )
         for name, fields in telemetry.profile.on_takeoff_accepted():
             telemetry.apply(name, fields)
@@ -159,7 +240,7 @@ class FlightCommands:
 
         async with telemetry.watching(watch):
             result = await self._command(_REQUEST_MESSAGE, HOME_POSITION_ID)
-            if not await telemetry.until(lambda: received, _SHOWN_TIMEOUT_S):
+            if not await telemetry.until(lambda: received, _HOME_TIMEOUT_S):
                 raise CommandRefusedError(
                     "home position not received: take-off needs home's altitude "
                     f"({result_name(result)}; no position estimate yet?)"

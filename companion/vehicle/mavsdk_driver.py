@@ -40,8 +40,8 @@ logger = logging.getLogger(__name__)
 _library_logger = logging.getLogger("mavsdk")
 
 _T = TypeVar("_T")
-# The base class applies both modes in their order of arrival.
-_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT", "CURRENT_MODE"} | {"COMMAND_ACK"})
+# The base class applies both modes and the acknowledgements in their order of arrival.
+_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT", "CURRENT_MODE"})
 # After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
 _STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {
@@ -164,15 +164,24 @@ class MavsdkDriver(AutopilotDriver):
 
     # --- commands and parameters --------------------------------------------------------------------
 
-    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
+    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        self._send_message("COMMAND_LONG", self._command_fields(command, parameters, confirmation))
+
+    def _command_fields(
+        self, command: int, parameters: tuple[float, ...], confirmation: int
+    ) -> dict[str, Any]:
         fields: dict[str, Any] = {
             "target_system": self._system_id,
             "target_component": AUTOPILOT_COMPONENT,
             "command": command,
-            "confirmation": 0,
+            "confirmation": confirmation,
         }
         for number, value in enumerate(parameters, start=1):
             fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
+        return fields
+
+    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
+        fields = self._command_fields(command, parameters, 0)
         if self._direct is None:
             raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()

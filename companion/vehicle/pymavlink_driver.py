@@ -29,8 +29,7 @@ _EKF_STATUS_REPORT = struct.Struct("<5fH")  # five variances, flags; airspeed_va
 _DECODED_IDS = {
     message_id
     for message_id, message in mavlink.mavlink_map.items()
-    if message.msgname
-    in TELEMETRY_MESSAGES | {"COMMAND_ACK", "PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
+    if message.msgname in TELEMETRY_MESSAGES | {"PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
 } - {HEARTBEAT_ID}
 
 # Command protocol: 5 attempts half a second apart; after IN_PROGRESS it only waits.
@@ -146,12 +145,12 @@ class PymavlinkDriver(AutopilotDriver):
             f"no answer to command {command} ({_ATTEMPTS} attempts, {_ATTEMPT_S:g} s apart)"
         )
 
-    def _send_command(self, command: int, parameters: tuple[float, ...], attempt: int) -> None:
+    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         fields = {
             "target_system": self._system_id or 0,
             "target_component": AUTOPILOT_COMPONENT,
             "command": command,
-            "confirmation": attempt,
+            "confirmation": confirmation,
         }
         values = {f"param{number}": value for number, value in enumerate(parameters, start=1)}
         self._send_message("COMMAND_LONG", fields | values)

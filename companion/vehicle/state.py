@@ -127,6 +127,9 @@ class VehicleState:
         battery_fraction: 0..1, None when unknown.
         ready_to_arm: the autopilot's own pre-arm checks pass, in its current mode.
         failsafe: the autopilot reports MAV_STATE_CRITICAL or EMERGENCY.
+        custom_mode: the autopilot's own number of `mode`, as it reports it.
+        mode_restored: in words, the newest request to return to a pilot's mode that a message of ours had
+            overridden; empty: none.
         intended_mode: the mode chosen last by the pilot or a command. A failsafe changes only `mode`.
         intended_beside: the `mode` reported together with the intended one. Both are UNKNOWN on an autopilot
             that does not report it (CURRENT_MODE: PX4 1.15 and newer).
@@ -174,6 +177,8 @@ class VehicleState:
     clock: ClockOffset | None = None
     gimbal: GimbalState | None = None
     reports: tuple[Report, ...] = ()
+    custom_mode: int = field(default=0, metadata={"recorded": False})
+    mode_restored: str = field(default="", metadata={"recorded": False})
     autopilot: str | None = None
     mav_type: int | None = None
     mav_autopilot: int | None = None

@@ -60,6 +60,7 @@ def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState
         heartbeat_ns=now_ns,
         armed=bool(fields["base_mode"] & _SAFETY_ARMED),
         mode=_mode(fields),
+        custom_mode=fields["custom_mode"],
         failsafe=fields["system_status"] in (_STATE_CRITICAL, _STATE_EMERGENCY),
         mav_type=fields["type"],
         mav_autopilot=fields["autopilot"],
@@ -73,9 +74,11 @@ def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleS
     intended, beside = state.intended_mode, state.intended_beside
     if "intended_custom_mode" in fields:
         intended, beside = mode_of_custom_mode(fields["intended_custom_mode"]), mode
-    if (mode, intended, beside) == (state.mode, state.intended_mode, state.intended_beside):
+    number = fields.get("custom_mode", state.custom_mode)
+    new = (mode, number, intended, beside)
+    if new == (state.mode, state.custom_mode, state.intended_mode, state.intended_beside):
         return state
-    return with_fields(state, mode=mode, intended_mode=intended, intended_beside=beside)
+    return with_fields(state, mode=mode, custom_mode=number, intended_mode=intended, intended_beside=beside)
 
 
 def _extended_sys_state(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:

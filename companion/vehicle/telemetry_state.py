@@ -46,6 +46,8 @@ class TelemetryState:
         clock: synchronisation of its clock with ours.
         mode_ns: when it last reported its mode, CLOCK_MONOTONIC.
         restarted: set when it has restarted; cleared by the link's supervision.
+        restart_count: how often it has restarted.
+        answered_ns: when the newest answered TIMESYNC request was sent, CLOCK_MONOTONIC.
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class TelemetryState:
         self.profile: AutopilotProfile = Px4Profile()
         self.clock = ClockSync()
         self.mode_ns = 0
+        self.restart_count = self.answered_ns = 0
         self.restarted = asyncio.Event()
         self._boot_ms: dict[str, int] = {}
         self._booting = False
@@ -116,6 +119,10 @@ class TelemetryState:
             reports = (*self.state.reports, report)[-REPORTS_KEPT:]
             self._publish(replace(self.state, reports=reports), "REPORT", {"report": report})
 
+    def on_mode_restored(self, text: str) -> None:
+        """Note that a pilot's mode was requested again."""
+        self._publish(replace(self.state, mode_restored=text), "MODE_RESTORED", {})
+
     def on_commander(self, commander: Commander) -> None:
         """Note a heartbeat of another service on the same vehicle."""
         others = (other for other in self.state.other_commanders if other.address != commander.address)
@@ -164,6 +171,7 @@ class TelemetryState:
 
     def _invalidate(self) -> None:
         """Clear what a restart may have changed, such as home."""
+        self.restart_count += 1
         self._boot_ms.clear()
         self.clock.reset()
         self.state = replace(
@@ -192,12 +200,17 @@ class TelemetryState:
     @contextlib.asynccontextmanager
     async def watching(self, watcher: Callable[[str, Fields], None]) -> AsyncIterator[None]:
         """Call back with every message while the context is active."""
-        key = object()
-        self._watchers[key] = watcher
+        end = self.watch(watcher)
         try:
             yield
         finally:
-            del self._watchers[key]
+            end()
+
+    def watch(self, watcher: Callable[[str, Fields], None]) -> Callable[[], None]:
+        """Call back with every message, in order of registration; returns a function that ends it."""
+        key = object()
+        self._watchers[key] = watcher
+        return lambda: self._watchers.pop(key, None) and None
 
     async def until(self, met: Callable[[], bool], timeout_s: float | None) -> bool:
         """Wait until a message makes the condition true; False on timeout."""

@@ -8,23 +8,25 @@ from typing import cast
 from companion.guidance.interface import Arm, FindGimbal, Request, SetMode
 from companion.service.requests import RequestRunner
 from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 
 
 class FakeDriver:
     """Raises a given exception, or waits forever."""
 
+    state = VehicleState()
+
     def __init__(self, fault: BaseException | None = None) -> None:
         self.fault = fault
         self.asked: list[str] = []
 
-    async def set_mode(self, mode: FlightMode) -> None:
+    async def set_mode(self, mode: FlightMode, *, since: VehicleState) -> None:
         self.asked.append(mode.value)
         if self.fault is not None:
             raise self.fault
         await asyncio.Event().wait()
 
-    async def arm(self) -> None:
+    async def arm(self, *, since: VehicleState) -> None:
         self.asked.append("arm")
 
     async def find_gimbal(self) -> bool:

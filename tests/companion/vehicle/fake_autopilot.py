@@ -33,7 +33,8 @@ class FakeAutopilot:
     def __init__(self, port: int, *, system_id: int = 1, component_id: int = 1, autopilot: int = 12) -> None:
         self.received: list[tuple[Any, bytes]] = []
         self.answers: dict[str, Callable[[Any], None]] = {
-            "COMMAND_LONG": lambda m: self.acknowledge(m.command)
+            "COMMAND_LONG": lambda m: self.acknowledge(m.command),
+            "TIMESYNC": lambda m: self.send(mavlink.MAVLink_timesync_message(time.monotonic_ns(), m.ts1)),
         }
         self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
         self.autopilot, self.mav_type, self.vtol_state = autopilot, 2, 0

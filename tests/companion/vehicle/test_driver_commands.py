@@ -99,7 +99,7 @@ async def test_takeoff_uses_home_after_arming(driver: Driver, autopilot: FakeAut
 async def test_takeoff_without_home_is_refused(
     driver: Driver, autopilot: FakeAutopilot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(flight_commands, "_SHOWN_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(flight_commands, "_HOME_TIMEOUT_S", 0.2)
     with pytest.raises(CommandRefusedError, match=r"home position .*: take-off"):
         await driver.takeoff(4.0)
     with pytest.raises(CommandRefusedError, match="above 0 m"):
@@ -108,7 +108,7 @@ async def test_takeoff_without_home_is_refused(
 
 
 async def test_unanswered_command_is_repeated_then_fails(driver: Driver, autopilot: FakeAutopilot) -> None:
-    autopilot.answers.clear()
+    autopilot.answers.pop("COMMAND_LONG")
     with pytest.raises(CommandRefusedError, match=r"no answer .*command 400 "):
         await driver.arm()
     attempts = [m.confirmation for m in autopilot.received_named("COMMAND_LONG") if m.command == 400]

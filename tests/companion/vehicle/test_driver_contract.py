@@ -89,7 +89,8 @@ async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKin
 
             await wait_for_state(second, complete)
             assert await second.get_parameter("COM_OF_LOSS_T") == 1.0
-            await asyncio.gather(second.takeoff(3.0), second.arm())
+            await second.takeoff(3.0)
+            await second.arm()
             await wait_for_state(second, lambda s: (s.altitude_m or 0.0) > 1.0)
             assert not driver.state.armed
             assert driver.state.altitude_m is not None
