@@ -14,6 +14,7 @@ ROOT = Path(__file__).parent.parent
 COMPANION_LAYERS = {
     "campaign": 0,
     "child_process": 1,
+    "clock": 0,
     "geometry": 0,
     "peer_data": 0,
     "plugins": 0,

@@ -120,6 +120,12 @@ class BehaviourRunner:
             self._out.result(command.identifier, Outcome(True, "in progress"))
             self._command = None
 
+    def end_after_standstill(self, why: str) -> None:
+        """The computer or the process stood still: our command ends in every phase."""
+        self.goal_ned_m = None
+        if self.behaviour is not None:
+            self._lose(why)
+
     def handle_error(self, error: Exception, context: BehaviourContext, sent_count: int) -> None:
         """A hook of the behaviour raised: hold. Call it from the exception handler."""
         name = "guidance" if self.behaviour is None else self.behaviour.name

@@ -15,8 +15,10 @@ import logging
 import math
 from dataclasses import dataclass, replace
 
+from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviour_runner import BehaviourRunner
+from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command_queue import CommandQueue
 from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
@@ -43,6 +45,8 @@ from vision.occupancy_grid import Point
 logger = logging.getLogger(__name__)
 
 OBSTACLE_DISTANCE_PERIOD_NS = 100_000_000
+# After a long standstill commands that waited in buffers arrive within this time.
+REFUSE_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +92,8 @@ class Guidance:
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
         self._landing_target_ns = self._obstacle_distance_ns = 0
+        self._standstill: Standstill | None = None
+        self._refuse_until_ns = 0
 
     @property
     def options(self) -> GuidanceOptions:
@@ -183,7 +189,12 @@ class Guidance:
             self.gimbal.end(now_ns, inputs.state, out)
             return self._output(None, released=self.gimbal.released)
         self._queue.watch(inputs.mode_changes, inputs.state, out)
+        if inputs.standstill is not None:
+            self._end_after(inputs.standstill, now_ns)
         for command in inputs.commands:
+            if (why := self._outdated(command, inputs.standstill, now_ns)) is not None:
+                out.result(command.identifier, Outcome(False, why))
+                continue
             self._queue.add(command, now_ns, inputs.state, self._runner.gimbal_user, out)
         for command in self._queue.take_due(context, out):
             self._begin_command(command, context)
@@ -214,6 +225,25 @@ class Guidance:
             if (why := self._setpoints.check_goals(each.goals(begun), context.state)) is not None:
                 return f"{each.name} would leave the limits: {why}"
         return None
+
+    def _end_after(self, standstill: Standstill, now_ns: int) -> None:
+        """The computer or the process stood still: whatever was commanded before ends, also what waits."""
+        self._queue.supersede(f"an event ({standstill.why})", self._out)
+        self._runner.end_after_standstill(standstill.why)
+        self._tracks = RecentTracks(max_age_s=self._options.track_max_age_s)
+        if standstill.long:
+            self._standstill, self._refuse_until_ns = standstill, now_ns + REFUSE_NS
+
+    def _outdated(self, command: CommandInput, standstill: Standstill | None, now_ns: int) -> str | None:
+        """Why a command is refused that may be from before a standstill; None: it is not.
+
+        A command that was sent to a process that stands still waits in a buffer, and arrives when it goes on.
+        """
+        if isinstance(command.behaviour, StopBehaviour | LandBehaviour):
+            return None
+        if standstill is None and now_ns < self._refuse_until_ns:
+            standstill = self._standstill
+        return None if standstill is None else f"{standstill.why}: give the command again"
 
     def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
         """The input of behaviours, without targets that are too old or whose camera direction is unknown."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
+from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.search_pattern import Footprint
@@ -197,6 +198,7 @@ class GuidanceInput:
         ending: the service ends: no command begins, and control is released.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
         altitude_acceptance_m: how far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known.
+        standstill: of the computer or the process, since the previous step; None: none.
     """
 
     state: VehicleState
@@ -217,6 +219,7 @@ class GuidanceInput:
     steering_markers: MarkerSight = NO_MARKERS
     velocities: tuple[VelocityInput, ...] = ()
     altitude_acceptance_m: float | None = None
+    standstill: Standstill | None = None
 
 
 @dataclass(frozen=True, slots=True)

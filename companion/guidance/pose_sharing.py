@@ -30,6 +30,12 @@ class PoseSharing:
         self.vehicle, self._on_event = vehicle, on_event
         self.source = uuid.uuid4().hex[:12]
         self._neighbours = Neighbours(vehicle, self.source)
+        self._valid_from_ns = 0
+
+    def discard_received(self, now_ns: int) -> None:
+        """What was received until now is outdated, also where it is processed later."""
+        self._valid_from_ns = now_ns
+        self._neighbours.discard_received()
 
     def on_message(self, payload: bytes, receipt_ns: int) -> None:
         """Handle a message on any vehicle's `pose` topic, received at that time (CLOCK_MONOTONIC ns).
@@ -37,7 +43,8 @@ class PoseSharing:
         Raises:
             PoseError: the message is not valid.
         """
-        self.ingest(pose_from_message(parse_object(payload)), receipt_ns)
+        if receipt_ns >= self._valid_from_ns:
+            self.ingest(pose_from_message(parse_object(payload)), receipt_ns)
 
     def ingest(self, pose: Pose, receipt_ns: int) -> None:
         """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds."""

@@ -114,6 +114,11 @@ class PerceptionCamera:
         heights = frozenset(self.settings.detector.heights())
         return RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
 
+    def discard_received(self) -> None:
+        """What was received is outdated."""
+        self.newest = self.planned = None
+        self.targets, self.fused = (), FusedTracks()
+
     def localize(self, result: PerceptionResult, history: StateHistory) -> None:
         """Set `targets` from a result, or `localization_error`."""
         try:

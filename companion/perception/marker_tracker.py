@@ -209,6 +209,11 @@ class MarkerTracker:
             for target in targets
         )
 
+    def discard_received(self) -> None:
+        """What was received is outdated."""
+        self._seen.clear()
+        self._runs.clear()
+
     def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the steering camera, for behaviours that fly to one."""
         if camera not in self._detecting:

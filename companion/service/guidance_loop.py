@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from companion.clock import Standstill
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput, StreamStatus
@@ -89,14 +90,17 @@ class GuidanceLoop:
 
     async def run(self) -> None:
         """Run until cancelled."""
-        while True:
-            now_ns = time.monotonic_ns()
-            seen, self._seen = self._seen, False
-            self._step(now_ns)
-            if seen:
-                self._streamer.send_now(now_ns)
-            self._on_step(now_ns)
-            await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
+        try:
+            while True:
+                now_ns = time.monotonic_ns()
+                seen, self._seen = self._seen, False
+                self._step(now_ns)
+                if seen:
+                    self._streamer.send_now(now_ns)
+                self._on_step(now_ns)
+                await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
+        finally:
+            self._driver.watch.end_of_loop()
 
     async def shut_down(self) -> None:
         """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD.
@@ -142,6 +146,9 @@ class GuidanceLoop:
             self._commands.close(ENDING)
 
     def _step(self, now_ns: int) -> GuidanceOutput:
+        seen = self._driver.watch.observe()
+        if seen.standstill is not None:
+            self._drop_outdated(seen.standstill, now_ns)
         stream = StreamStatus(self._streamer.state, self._streamer.sent_count)
         inputs = self._inputs.assemble(
             now_ns,
@@ -150,15 +157,25 @@ class GuidanceLoop:
             answers=self._requests.take_answers(),
             commands=self._commands.take_commands(),
             ending=self._ending,
+            standstill=seen.standstill,
         )
         name = "" if self.guidance.behaviour is None else self.guidance.behaviour.name
         begun_ns, used_ns = time.monotonic_ns(), time.thread_time_ns()
         output = self.guidance.step(now_ns, inputs)
         self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
+        self._driver.watch.acknowledge(seen)
         context = self._inputs.step_context(self.guidance.gimbal.mounting)
         self._record(now_ns, context, inputs, output)
         return output
+
+    def _drop_outdated(self, standstill: Standstill, now_ns: int) -> None:
+        """The computer or the process stood still: nothing from before may take effect."""
+        self._on_event("warning", f"{standstill.why}: what was commanded before has ended")
+        self._requests.abandon_motion(standstill.why)
+        if standstill.outdated:
+            self._driver.discard_received()
+            self._inputs.discard_received(now_ns)
 
     def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:
         """Warn of a behaviour with a slow update (`before`: the behaviour before the step, if any).

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
@@ -71,6 +72,7 @@ class InputAssembler:
         self.altitude_acceptance_m: float | None = None
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
+        self._valid_from_ns = 0
         self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
@@ -110,6 +112,8 @@ class InputAssembler:
     def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
         """Process a camera's result; returns its markers if marker detection is on."""
         markers = None
+        if result.captured_ns < self._valid_from_ns:
+            return None
         if result.markers is not None:
             markers = self._markers.localize(camera, result, self.history, self._state)
         if camera is self.steering:
@@ -127,13 +131,16 @@ class InputAssembler:
         answers: Sequence[Answer] = (),
         commands: Sequence[CommandInput] = (),
         ending: bool = False,
+        standstill: Standstill | None = None,
     ) -> GuidanceInput:
         """Assemble the input of one step."""
         steering, newest = self.steering, self.steering.newest
+        if newest is not None and newest.captured_ns < self._valid_from_ns:
+            newest = None
         return GuidanceInput(
             state,
             stream,
-            steering.targets,
+            () if newest is None else steering.targets,
             None if newest is None else newest.captured_ns,
             self._obstacles,
             steering.planned,
@@ -148,7 +155,16 @@ class InputAssembler:
             self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
             self.velocities.newest(now_ns),
             self.altitude_acceptance_m,
+            standstill,
         )
+
+    def discard_received(self, now_ns: int) -> None:
+        """The computer stood still until now: images, poses and velocities from before are outdated."""
+        self._valid_from_ns, self._obstacles = now_ns, None
+        self.steering.discard_received()
+        self._markers.discard_received()
+        self.poses.discard_received(now_ns)
+        self.velocities.discard_received(now_ns)
 
     def step_context(self, mounting: GimbalMounting) -> StepContext:
         """Return what is recorded of a step besides its input, for one caller.

@@ -69,6 +69,7 @@ class RequestRunner:
         self._driver, self._on_answer = driver, on_answer
         self._tasks: dict[int, asyncio.Task[None]] = {}
         self._cancelled: set[int] = set()
+        self._motion: set[int] = set()
         self._answers: list[Answer] = []
 
     def start(self, request: Request) -> None:
@@ -76,6 +77,8 @@ class RequestRunner:
         # The state of the step that has decided it: a report may come before the task begins.
         task = spawn(self._run(request, self._driver.state), f"request {request.action}")
         self._tasks[request.identifier] = task
+        if isinstance(request.action, SetMode | Arm | Disarm | TakeOff):
+            self._motion.add(request.identifier)
         task.add_done_callback(lambda done: self._on_done(request.identifier, done))
 
     def cancel(self, identifier: int) -> None:
@@ -87,6 +90,7 @@ class RequestRunner:
 
     def _on_done(self, identifier: int, task: asyncio.Task[None]) -> None:
         self._tasks.pop(identifier, None)
+        self._motion.discard(identifier)
         if task.cancelled() and identifier not in self._cancelled:
             # Not cancelled by us: without an answer guidance would wait forever.
             self._answers.append(Answer(identifier, "the request was cancelled"))
@@ -97,6 +101,12 @@ class RequestRunner:
         """Return the answers since the last call."""
         answers, self._answers = tuple(self._answers), []
         return answers
+
+    def abandon_motion(self, why: str) -> None:
+        """Cancel what changes the mode or the arming, and answer it as refused."""
+        for identifier in sorted(self._motion):
+            self._answers.append(Answer(identifier, why))
+            self.cancel(identifier)
 
     async def close(self) -> None:
         """Cancel all pending requests."""

@@ -73,7 +73,7 @@ class Service:
         log = EventLog(lambda event: self.bus.publish(topics.EVENTS, event), on_event)
         self.events, self._event = log.newest, log.add
         self.driver: Driver = driver_of(settings, lambda sent, data: self._tap.on_bytes(sent, data))
-        self.streamer = streamer_of(settings, self.driver.send_setpoint)
+        self.streamer = streamer_of(settings, self.driver.send_setpoint, self.driver.watch.now_ns)
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
         self.cameras = open_cameras(
             settings,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from pydantic import TypeAdapter, ValidationError
 
 from companion.bus.bodies.vehicle import VelocityBody
@@ -24,6 +26,12 @@ class VelocitySenders:
         self._newest: dict[str, VelocityInput] = {}
         self._delays: dict[str, SenderDelay] = {}
         self._stamps_ns: dict[str, int] = {}
+        self._valid_from_ns = 0
+
+    def discard_received(self, now_ns: int) -> None:
+        """What was received until now is outdated, also where it is processed later."""
+        self._valid_from_ns = now_ns
+        self._newest = {source: replace(each, expires_ns=0) for source, each in self._newest.items()}
 
     def on_message(self, payload: bytes, receipt_ns: int) -> None:
         """Process a message. Its lifetime counts from when it was sent, as far as its delay is known.
@@ -31,6 +39,8 @@ class VelocitySenders:
         Raises:
             PeerDataError: the message is not valid, is overtaken by a newer one, or has arrived expired.
         """
+        if receipt_ns < self._valid_from_ns:
+            return
         message = parse_object(payload)
         try:
             body = _BODY.validate_python(message, strict=True)

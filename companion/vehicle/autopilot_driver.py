@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+from companion.clock import StandstillWatch
 from companion.tasks import spawn
 from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
@@ -89,6 +90,7 @@ class AutopilotDriver(ABC):
         self._wanted_system_id = system_id
         self._own_system_id = own_system_id
         self._own_component_id = own_component_id
+        self.watch = StandstillWatch()
         self._started_ns = time.monotonic_ns()
         self._telemetry = TelemetryState(url, self._warn_other_autopilot, range_finder_height)
         self._flight_commands = FlightCommands(
@@ -278,6 +280,13 @@ class AutopilotDriver(ABC):
         if ours and self._autopilot_kind in self.supported_autopilots:
             self._on_frames(ours)
 
+    def discard_received(self) -> None:
+        """See Driver. The autopilot's heartbeat counts as lost until the next one."""
+        if self._link is not None:
+            self._link.discard_received()
+        self._framer = Framer()
+        self._telemetry.discard_received()
+
     def _send_signed_time(self, source: Source) -> None:
         """Send a signed heartbeat: a peer with an old clock takes its time from it (PX4 after a restart)."""
         now_ns = time.monotonic_ns()
@@ -388,7 +397,7 @@ class AutopilotDriver(ABC):
     # --- sending ------------------------------------------------------------------------------------
 
     def _transmit(self, frame: bytes) -> None:
-        if self._link is None or self._is_withheld(frame):
+        if self._link is None:
             return
         ready = frame if self._signer is None else self._signer.signed(frame)
         # A stopped process resumes where it was, perhaps after the freshness check of a setpoint; sending it
@@ -397,16 +406,20 @@ class AutopilotDriver(ABC):
         if stamp_ms is not None and (self._boot_ms() - stamp_ms) & 0xFFFF_FFFF > LEAVES_WITHIN_S * 1e3:
             self._warn_stale_setpoint()
             return
+        if self._is_withheld(frame):
+            return
         self._link.send(ready)
         if self._on_bytes is not None:
             self._on_bytes(True, ready)
 
     def _is_withheld(self, frame: bytes) -> bool:
-        """Whether a frame may not go to this vehicle. Everything that is sent passes here.
+        """Whether a frame may not go to this vehicle, or not now. Everything that is sent passes here.
 
-        What the callers refuse beforehand may have been sent by then, and would be repeated.
+        What the callers refuse beforehand may have been sent by then, and would be repeated. After a
+        standstill a repetition from before may come first, until the loop that steers has ended it.
         """
-        why = self._telemetry.state.not_flown
+        standstill = self.watch.observe().standstill
+        why = self._telemetry.state.not_flown or (None if standstill is None else standstill.why)
         if why is None or all(map(is_harmless, frames_of(frame))):
             return False
         if why != self._withheld:
@@ -420,7 +433,7 @@ class AutopilotDriver(ABC):
             raise CommandRefusedError(f"{what} not sent: {why}")
 
     def _boot_ms(self) -> int:
-        return (time.monotonic_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
+        return (self.watch.now_ns() - self._started_ns) // 1_000_000 & 0xFFFF_FFFF
 
     def _warn_stale_setpoint(self) -> None:
         logger.warning("%s: setpoint dropped: it expired before it was sent", self.url)
@@ -460,7 +473,7 @@ class AutopilotDriver(ABC):
             return
         stamp_ms = self._boot_ms()
         # Checked after the stamp: if the process is stopped between the two, one of them detects it.
-        if setpoint.expired(time.monotonic_ns()):
+        if setpoint.expired(self.watch.now_ns()):
             self._warn_stale_setpoint()
             return
         setpoint = setpoint.moved(self._telemetry.state.reset_offset_ned_m)

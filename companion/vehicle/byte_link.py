@@ -31,6 +31,7 @@ Received = Callable[[bytes, Source], None]
 
 _READ_BYTES = 65535
 _MAX_READS_PER_CALLBACK = 64  # then other work of the loop runs
+_MAX_DISCARDED = 10_000  # more than a socket's buffer holds
 _REOPEN_S = 0.5
 # The unsent rest of a frame is dropped after this time.
 _PARTIAL_FRAME_S = 0.3
@@ -48,6 +49,9 @@ class ByteLink(Protocol):
 
     def answer_to(self, source: Source) -> None:
         """Set the peer to send to. Has an effect only on a listening UDP link."""
+
+    def discard_received(self) -> None:
+        """Read and drop what waits in the system's buffer. Never raises."""
 
     async def close(self) -> None:
         """Release everything. Never raises; can be called twice."""
@@ -147,6 +151,16 @@ class _UdpLink:
         else:
             self._send_failing = False
 
+    def discard_received(self) -> None:
+        for _ in range(_MAX_DISCARDED):
+            try:
+                self._socket.recv(_READ_BYTES)
+            except BlockingIOError:
+                return
+            except OSError as error:
+                logger.debug("%s: %s", self._url, error)
+                return
+
     def answer_to(self, source: Source) -> None:
         if not self._peer_is_fixed and source != self._peer:
             if self._peer is not None:
@@ -228,6 +242,15 @@ class _StreamLink:
         self.dropped_count += 1
         self._unsent = b""
         self._loop.remove_writer(self._descriptor)
+
+    def discard_received(self) -> None:
+        for _ in range(_MAX_DISCARDED):
+            try:
+                if self._descriptor < 0 or not os.read(self._descriptor, _READ_BYTES):
+                    return
+            except OSError as error:  # empty, or lost, which the next read reports
+                logger.debug("%s: %s", self._url, error)
+                return
 
     def answer_to(self, source: Source) -> None:
         """Does nothing: a stream has one peer."""

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
+from companion.clock import StandstillWatch
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -64,6 +65,16 @@ class Driver(Protocol):
 
     async def close(self) -> None:
         """Close the link. Never raises; can be called twice."""
+
+    @property
+    def watch(self) -> StandstillWatch:
+        """Detects a standstill. Until it is acknowledged no setpoint, mode, arming or take-off is sent.
+
+        The loop that steers acknowledges at the end of its steps.
+        """
+
+    def discard_received(self) -> None:
+        """What was received is outdated, also what waits in the link's buffers: the state has no stamps."""
 
     @property
     def link_count(self) -> int:

@@ -35,7 +35,8 @@ class Setpoint:
     """Exactly one of position and velocity; at most one of yaw and yaw rate (none: keep the heading).
 
     Attributes:
-        deadline_ns: CLOCK_MONOTONIC nanoseconds after which it must not be sent.
+        deadline_ns: after which it must not be sent: CLOCK_MONOTONIC nanoseconds, compared with a clock that
+            counts a suspend (`companion.clock`).
         position_ned_m: metres, local NED.
         velocity_ned_mps: metres a second, local NED.
         acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 adds it to the output

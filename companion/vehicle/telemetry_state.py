@@ -187,6 +187,28 @@ class TelemetryState:
             gimbal=None,
         )
 
+    def discard_received(self) -> None:
+        """The computer stood still: what is known of the vehicle is outdated."""
+        self.clock.reset()
+        self._publish(
+            replace(
+                self.state,
+                heartbeat_ns=0,
+                attitude_ns=0,
+                position_ns=0,
+                global_ns=0,
+                battery_ns=0,
+                attitude=None,
+                position_ned_m=None,
+                ground=None,
+                odometry=None,
+                clock=None,
+                gimbal=None,
+            ),
+            "DISCARDED",
+            {},
+        )
+
     def two_autopilots(self, now_ns: int) -> bool:
         """Whether two autopilots with one id were detected recently."""
         return self._two_seen_ns > 0 and now_ns - self._two_seen_ns < HEARTBEAT_MAX_AGE_S * 1e9

@@ -41,7 +41,7 @@ class LiveFlight:
         link = {"vehicle.driver": kind, "vehicle.url": f"udpin://127.0.0.1:{port}"}
         settings = plain_settings({"detector.enabled": "false", **link, **(changes or {})})
         self.driver = driver_of(settings)
-        self.streamer = Streamer(self.driver.send_setpoint)
+        self.streamer = Streamer(self.driver.send_setpoint, clock_ns=self.driver.watch.now_ns)
         self.events: list[tuple[str, str]] = []
         self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
         self.inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], self._event)

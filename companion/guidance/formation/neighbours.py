@@ -161,6 +161,10 @@ class Neighbours:
     refused: int = 0
     _received: dict[str, _Received] = field(default_factory=dict)
 
+    def discard_received(self) -> None:
+        """What was received is outdated."""
+        self._received.clear()
+
     def ingest(self, pose: Pose, receipt_ns: int) -> None:
         """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds of this host."""
         name = pose.vehicle

@@ -10,6 +10,7 @@ from functools import cache
 from typing import Any
 
 from companion.bench.lockstep_flight import vehicle_in_the_air
+from companion.clock import StandstillWatch
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions
@@ -290,7 +291,9 @@ class GuidanceHarness:
         self.events: list[GuidanceEvent] = []
         self.outputs: list[GuidanceOutput] = []
         self.path_requests: list[PathRequest] = []
-        self.streamer = Streamer(self.autopilot.setpoints.append, clock_ns=lambda: vehicle.now_ns)
+        self._suspended_ns = 0
+        self.watch = StandstillWatch(lambda: vehicle.now_ns, lambda: vehicle.now_ns - self._suspended_ns)
+        self.streamer = Streamer(self.autopilot.setpoints.append, clock_ns=self.watch.now_ns)
         self.guidance = Guidance(options)
         self.vehicle = vehicle
         self.streaming = True
@@ -299,19 +302,31 @@ class GuidanceHarness:
         self._class_names, self._inputs = class_names, inputs
         self._identifiers = itertools.count(1)
 
+    @property
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC of the companion; the vehicle's clock is CLOCK_BOOTTIME."""
+        return self.vehicle.now_ns - self._suspended_ns
+
     def run(self, seconds: float = STEP_S) -> None:
         """Advance time."""
         for _ in range(max(1, round(seconds / STEP_S))):
             self.autopilot.step(STEP_S)
             self.step()
             if self.streaming:
-                self.streamer.tick(self.vehicle.now_ns)
+                self.streamer.tick(self.watch.now_ns())
+
+    def stand_still(self, seconds: float, *, suspended: bool) -> None:
+        """The vehicle goes on alone: the computer is suspended, or the process is stopped (SIGSTOP)."""
+        for _ in range(round(seconds / STEP_S)):
+            self.autopilot.step(STEP_S)
+            self._suspended_ns += round(STEP_S * 1e9) if suspended else 0
 
     def step(self, *commands: CommandInput, ending: bool = False) -> GuidanceOutput:
         """One step of guidance, now."""
-        now_ns, age_s = self.vehicle.now_ns, self.perception_age_s
+        now_ns, age_s = self.now_ns, self.perception_age_s
+        seen = self.watch.observe()
         inputs = GuidanceInput(
-            self.autopilot.state,
+            self._state(),
             StreamStatus(self.streamer.state, self.streamer.sent_count),
             seen_ns=None if age_s is None else now_ns - round(age_s * 1e9),
             class_names=self._class_names,
@@ -319,6 +334,7 @@ class GuidanceHarness:
             answers=self.autopilot.take_answers(),
             commands=commands,
             ending=ending,
+            standstill=seen.standstill,
         )
         output = self.guidance.step(now_ns, self._inputs(inputs))
         apply_output(
@@ -330,10 +346,22 @@ class GuidanceHarness:
             send_obstacle_distance=self.autopilot.obstacle_distances.append,
             request_path=self.path_requests.append,
         )
+        self.watch.acknowledge(seen)
         self.events += output.events
         self.outputs.append(output)
         self.results |= {result.identifier: result.outcome for result in output.results}
         return output
+
+    def _state(self) -> VehicleState:
+        """The vehicle's state, stamped by the companion's clock."""
+        state, late_ns = self.autopilot.state, self._suspended_ns
+        return replace(
+            state,
+            heartbeat_ns=state.heartbeat_ns - late_ns,
+            position_ns=state.position_ns - late_ns,
+            attitude_ns=state.attitude_ns - late_ns,
+            battery_ns=state.battery_ns - late_ns,
+        )
 
     def command(
         self, behaviour: Behaviour | None = None, *, aim: GimbalAim | None = None, endless: bool = False

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from companion.clock import Standstill, StandstillWatch
 from companion.guidance.behaviour import BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import GuidanceInput, StreamStatus
@@ -56,7 +57,11 @@ class LoopHarness:
             sleeper=self._sleeper,
         )
         self.behaviour = SlowBehaviour()
-        self.used_ns = 0
+        self.used_ns = self.suspended_ns = 0
+        self.discarded: list[str] = []
+        self.watch = StandstillWatch(
+            lambda: self.vehicle.now_ns + self.suspended_ns, lambda: self.vehicle.now_ns
+        )
         self.events: list[str] = []
         engaged(self.harness, self.behaviour)
         clock = SimpleNamespace(
@@ -85,7 +90,11 @@ class LoopHarness:
             self.harness.guidance,
             self._inputs(),
             SimpleNamespace(
-                state=self.harness.autopilot.state, send_landing_target=None, send_obstacle_distance=None
+                state=self.harness.autopilot.state,
+                watch=self.watch,
+                discard_received=lambda: self.discarded.append("driver"),
+                send_landing_target=None,
+                send_obstacle_distance=None,
             ),
             self.streamer,
             rate_hz=1 / STEP_S,
@@ -105,15 +114,20 @@ class LoopHarness:
         autopilot = self.harness.autopilot
 
         def assemble(
-            now_ns: int, state: VehicleState, stream: StreamStatus, **_rest: object
+            now_ns: int,
+            state: VehicleState,
+            stream: StreamStatus,
+            standstill: Standstill | None = None,
+            **_rest: object,
         ) -> GuidanceInput:
             return GuidanceInput(
                 autopilot.state, stream, seen_ns=now_ns, mode_changes=autopilot.mode_changes,
-                answers=autopilot.take_answers(),
+                answers=autopilot.take_answers(), standstill=standstill,
             )  # fmt: skip
 
         return SimpleNamespace(
             assemble=assemble,
+            discard_received=lambda now_ns: self.discarded.append("inputs"),
             step_context=lambda mounting: None,
             steering=SimpleNamespace(request_path=None),
             select=None,
@@ -173,3 +187,25 @@ async def test_setpoint_of_an_update_that_took_too_long_is_expired(loop: LoopHar
     after = [(at_ns, state) for at_ns, state in loop.sent if at_ns > blocked_ns + 20 * MS]
     assert after[0][0] - blocked_ns >= 600 * MS
     assert {state for _, state in after} == {StreamState.BRAKING}
+
+
+async def test_suspend_ends_the_command_and_discards_what_was_received(loop: LoopHarness) -> None:
+    await loop.run(0.2)
+    at_ns = loop.vehicle.now_ns
+    loop.suspended_ns = 42_000_000_000
+    await loop.run(2.0)
+    assert loop.discarded == ["driver", "inputs"]
+    assert [sent_ns for sent_ns, _ in loop.sent if sent_ns > at_ns] == []
+    assert not loop.harness.guidance.in_command
+    assert "suspended for 42.0 s" in loop.events[0]
+    assert loop.watch.observe().standstill is None, "acknowledged"
+
+
+async def test_short_suspend_changes_nothing(loop: LoopHarness) -> None:
+    await loop.run(0.2)
+    at_ns = loop.vehicle.now_ns
+    loop.suspended_ns = 200_000_000
+    await loop.run(2.0)
+    assert loop.discarded == []
+    assert loop.harness.guidance.in_command
+    assert {state for sent_ns, state in loop.sent if sent_ns > at_ns + 100 * MS} == {StreamState.FRESH}

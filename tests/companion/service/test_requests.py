@@ -75,3 +75,20 @@ async def test_cancelled_request_is_not_answered() -> None:
     await runner.close()
     assert runner.take_answers() == ()
     assert not answered.is_set()
+
+
+async def test_requests_that_move_are_abandoned_with_an_answer() -> None:
+    driver = FakeDriver()
+    runner, _ = runner_of(driver)
+    runner.start(Request(7, SetMode(FlightMode.OFFBOARD)))
+    runner.start(Request(8, FindGimbal()))
+    runner.start(Request(9, Arm()))  # has not begun yet
+    runner.abandon_motion("suspended")
+    await asyncio.sleep(0)
+    await runner.close()
+    answers = runner.take_answers()
+    assert [(answer.identifier, answer.refused) for answer in answers[:2]] == [
+        (7, "suspended"),
+        (9, "suspended"),
+    ]
+    assert driver.asked == []

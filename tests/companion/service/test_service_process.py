@@ -9,6 +9,7 @@ import queue
 import signal
 import socket
 import subprocess
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import imageio_ffmpeg  # type: ignore[import-untyped]
 import pytest
 import zenoh
 
-from companion.bus.client import listen
+from companion.bus.client import listen, send_command
 from companion.bus.topics import command_key
 from mavlink_sim.testing import QUICK_FLIGHT, free_port, running_simulator
 from tests.companion.command_line import companion_here
@@ -142,6 +143,38 @@ def test_lost_vehicle_is_reconnected_and_no_command_retaken(tmp_path: Path) -> N
             back = [r["stamp_ns"] for r in between if r["mode"] == "OFFBOARD"]
             times_s = [(at - row["stamp_ns"]) / 1e9 for at in (*back[:1], *back[-1:])]
             assert not back, f"in OFFBOARD again at {times_s} s: {service.lines}"
+
+
+def test_process_stopped_while_arming_does_not_arm_afterwards(tmp_path: Path) -> None:
+    with (
+        running_simulator(ready_after=0.0) as simulator,
+        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path) as service,
+        service.client() as session,
+    ):
+        service.wait_for_line("autopilot heartbeat received")
+        with pytest.raises(TimeoutError):
+            service.wait_for_line("never", 2.5)  # home and the pre-arm checks are known by then
+        lost = len(simulator.events)
+        simulator.fault("link_loss")
+        simulator.wait_for_event("link_loss begins", since=lost)
+        replies: list[dict[str, Any]] = []
+        takeoff = threading.Thread(
+            target=lambda: replies.append(send_command(session, "vehicle1", "takeoff 3", timeout_s=40.0))
+        )
+        takeoff.start()
+        service.wait_for_line("command: takeoff")
+        with pytest.raises(TimeoutError):
+            service.wait_for_line("takeoff altitude=3:", 0.3)  # not refused: arming is requested
+        service.signal(signal.SIGSTOP)
+        simulator.fault("end all")
+        simulator.wait_for_event("link_loss ends", since=lost)
+        time.sleep(2.0)
+        service.signal(signal.SIGCONT)
+        takeoff.join(40.0)
+        assert not replies[0]["success"]
+        assert "paused" in replies[0]["reason"]
+        time.sleep(3.0)  # longer than arming is repeated
+        assert "armed" not in simulator.events
 
 
 MISSION = """

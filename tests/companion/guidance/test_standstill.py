@@ -1,0 +1,233 @@
+"""After a suspend or a stop of the process nothing flies that was commanded before."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from companion.guidance.behaviour import VelocityInput
+from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
+from companion.guidance.command import NO_CONTEXT
+from companion.guidance.core import REFUSE_NS, GuidanceOptions
+from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.gimbal.controller import GimbalMounting
+from companion.guidance.grammar import parse
+from companion.guidance.interface import CommandInput, EventKind, GuidanceInput
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.vehicle.state import FlightMode, LandedState
+from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, engaged, flying, parked
+
+LEADER = Neighbour("alpha", (20.0, 0.0, -5.0), (0.0, 0.0, 0.0), 0.0, 0.0, age_s=0.1)
+
+
+def with_leader(inputs: GuidanceInput) -> GuidanceInput:
+    velocity = VelocityInput("pad", inputs.state.heartbeat_ns, inputs.state.heartbeat_ns + 10**9, 1.0)
+    return replace(inputs, neighbourhood=Neighbourhood("own", (LEADER,)), velocities=(velocity,))
+
+
+def on_ground() -> GuidanceHarness:
+    harness = GuidanceHarness(parked(), lag_s=0.4)
+    harness.run(0.5)
+    return harness
+
+
+def in_flight() -> GuidanceHarness:
+    harness = GuidanceHarness(flying(), lag_s=0.2, inputs=with_leader)
+    harness.run(0.3)
+    return harness
+
+
+def _before_arming() -> GuidanceHarness:
+    """The pre-arm checks still run."""
+    harness = on_ground()
+    harness._inputs = lambda inputs: replace(inputs, state=replace(inputs.state, ready_to_arm=False))
+    harness.command(TakeoffBehaviour(4.0))
+    harness.run(0.5)
+    assert harness.autopilot.requests == []
+    return harness
+
+
+def _while_arming() -> GuidanceHarness:
+    harness = on_ground()
+    harness.command(TakeoffBehaviour(4.0))
+    assert harness.autopilot.requests == ["arm"]
+    return harness
+
+
+def _after_arming() -> GuidanceHarness:
+    harness = _while_arming()
+    harness.until(lambda: harness.autopilot.state.armed, 2.0)
+    return harness
+
+
+def _in_the_climb() -> GuidanceHarness:
+    harness = on_ground()
+    harness.command(TakeoffBehaviour(4.0))
+    harness.until(lambda: harness.vehicle.position[2] < -1.0)
+    return harness
+
+
+def _end_of_the_climb() -> GuidanceHarness:
+    """A short take-off is finished by setpoints, about to be requested."""
+    harness = on_ground()
+    harness.autopilot.takeoff_short_m = 0.7
+    harness.command(TakeoffBehaviour(4.0))
+    harness.until(lambda: harness.vehicle.landed is LandedState.IN_AIR)
+    return harness
+
+
+def _engaging() -> GuidanceHarness:
+    harness = in_flight()
+    harness.command(HoldBehaviour())
+    harness.run()
+    return harness
+
+
+def _flown(text: str) -> Callable[[], GuidanceHarness]:
+    def made() -> GuidanceHarness:
+        harness = in_flight()
+        harness.command(parse(text).build(NO_CONTEXT))
+        harness.until(lambda: harness.guidance.phase == "offboard")
+        harness.run(0.5)
+        return harness
+
+    return made
+
+
+def _hold_between_commands() -> GuidanceHarness:
+    harness = in_flight()
+    harness.outcome(harness.command(HoldBehaviour(0.2)))
+    assert harness.guidance.phase == "offboard"
+    return harness
+
+
+def _mission(*steps: str, at: str) -> Callable[[], GuidanceHarness]:
+    def made() -> GuidanceHarness:
+        harness = on_ground()
+        text = "".join(f'[[step]]\ndo = "{step}"\non_failure = "continue"\n' for step in steps)
+        plan = plan_from(text, "test.toml")
+        harness.command(SequenceBehaviour(plan, harness.guidance.check_requirements))
+        harness.until(lambda: harness.guidance.active is not None and harness.guidance.active.name == at)
+        harness.run(0.3)
+        return harness
+
+    return made
+
+
+def _waiting_for_the_gimbal() -> GuidanceHarness:
+    mounting = GimbalMounting(carries_camera=True, carries_steering=True)
+    harness = GuidanceHarness(
+        flying(), lag_s=0.2, inputs=with_leader, options=GuidanceOptions(gimbal=mounting)
+    )
+    harness.run(0.3)
+    harness.command(parse("seek car sweep=-60").build(NO_CONTEXT))
+    assert not harness.guidance.in_command
+    return harness
+
+
+PHASES: dict[str, Callable[[], GuidanceHarness]] = {
+    "waiting for the gimbal": _waiting_for_the_gimbal,
+    "before arming": _before_arming,
+    "while arming": _while_arming,
+    "after arming": _after_arming,
+    "in the climb": _in_the_climb,
+    "end of the climb": _end_of_the_climb,
+    "engaging": _engaging,
+    "hold": _hold_between_commands,
+    "goto": _flown("goto 60 0"),
+    "orbit": _flown("orbit radius=6"),
+    "seek": _flown("seek car"),
+    "follow-path": _flown("follow-path points=0,0;40,0"),
+    "velocity": _flown("velocity"),
+    "formation": _flown("formation line alpha"),
+    "mission in goto": _mission("takeoff 3", "goto 30 0", "land", at="goto"),
+    "mission in land": _mission("takeoff 3", "land", "takeoff 4", "hold 5", at="land"),
+    "mission in takeoff": _mission("takeoff 3", "hold 5", "land", "takeoff 3", at="takeoff"),
+}
+STARTS = {"arm", "offboard", "takeoff 3", "takeoff 4", "mission", "takeoff"}
+
+
+@pytest.mark.parametrize("suspended", [True, False], ids=["suspend", "stop"])
+@pytest.mark.parametrize("seconds", [0.2, 1.0, 5.0, 60.0])
+@pytest.mark.parametrize("phase", PHASES)
+def test_nothing_starts_after_a_standstill(phase: str, seconds: float, suspended: bool) -> None:
+    harness = PHASES[phase]()
+    harness.stand_still(seconds, suspended=suspended)
+    requests, setpoints = len(harness.autopilot.requests), len(harness.autopilot.setpoints)
+    active = harness.guidance.behaviour
+    harness._inputs = with_leader
+    harness.autopilot.gimbal = ScriptedGimbal()
+    if seconds < 0.3:
+        harness.run()
+        assert active is None or harness.guidance.behaviour is active  # too short to matter
+        return
+    harness.run(20.0)
+    assert not STARTS & set(harness.autopilot.requests[requests:])
+    assert len(harness.autopilot.setpoints) == setpoints
+    assert not harness.guidance.in_command
+    # The operator's next command flies.
+    if harness.vehicle.landed is LandedState.IN_AIR:
+        engaged(harness, HoldBehaviour())
+        assert len(harness.autopilot.setpoints) > setpoints
+
+
+def test_end_of_the_command_names_the_suspend() -> None:
+    harness = in_flight()
+    pending = harness.command(GotoBehaviour(from_home_m=(50.0, 0.0)))
+    harness.until(lambda: harness.guidance.phase == "offboard")
+    harness.stand_still(42.0, suspended=True)
+    harness.run()
+    assert "suspended for 42.0 s" in pending.result().reason
+    assert harness.events[-1].kind is EventKind.LOST
+
+
+@pytest.mark.parametrize("suspended", [True, False])
+def test_command_that_waited_in_a_buffer_is_refused(suspended: bool) -> None:
+    harness = in_flight()
+    harness.stand_still(30.0, suspended=suspended)
+    first = harness.command(HoldBehaviour())  # read before guidance's first step
+    assert not first.result().success
+    harness.run(0.2)
+    assert not harness.command(HoldBehaviour()).result().success
+    harness.run(REFUSE_NS / 1e9)
+    assert not harness.command(HoldBehaviour()).done()
+
+
+@pytest.mark.parametrize("behaviour", [StopBehaviour, LandBehaviour, ReturnBehaviour])
+def test_commands_that_end_a_flight_are_not_refused(
+    behaviour: type[StopBehaviour] | type[LandBehaviour],
+) -> None:
+    harness = in_flight()
+    harness.stand_still(30.0, suspended=True)
+    assert not harness.command(behaviour()).done()
+
+
+def test_pilot_flies_on_after_a_standstill() -> None:
+    harness = _flown("goto 60 0")()
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    harness.stand_still(10.0, suspended=True)
+    harness.run(5.0)
+    assert harness.vehicle.mode is FlightMode.POSITION
+
+
+def test_track_from_before_a_suspend_is_forgotten() -> None:
+    harness = in_flight()
+    harness.stand_still(30.0, suspended=True)
+    harness.run(1.1)
+    outcome = harness.command(ApproachBehaviour("", track_id=7)).result()
+    assert not outcome.success
+
+
+def test_waiting_command_is_answered_after_a_standstill() -> None:
+    harness = in_flight()
+    seek = parse("seek car sweep=-60").build(NO_CONTEXT)
+    harness.step(CommandInput(99, "seek", seek))
+    harness.stand_still(1.0, suspended=True)
+    harness.step()
+    assert not harness.results[99].success
