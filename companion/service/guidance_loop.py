@@ -173,6 +173,7 @@ class GuidanceLoop:
         """The computer or the process stood still: nothing from before may take effect."""
         self._on_event("warning", f"{standstill.why}: what was commanded before has ended")
         self._requests.abandon_motion(standstill.why)
+        self._driver.abandon(standstill.why)
         if standstill.outdated:
             self._driver.discard_received()
             self._inputs.discard_received(now_ns)

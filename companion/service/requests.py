@@ -30,6 +30,9 @@ from vision.path_planner import PathRequest
 
 logger = logging.getLogger(__name__)
 
+# How long after guidance's decision a request may be sent or repeated: a take-off waits up to 3 s for home.
+VALID_NS = 8_000_000_000
+
 
 def apply_output(
     output: GuidanceOutput,
@@ -74,8 +77,9 @@ class RequestRunner:
 
     def start(self, request: Request) -> None:
         """Start a request."""
-        # The state of the step that has decided it: a report may come before the task begins.
-        task = spawn(self._run(request, self._driver.state), f"request {request.action}")
+        # Of the step that has decided it: a report, or a standstill, may come before the task begins.
+        since, until_ns = self._driver.state, self._driver.watch.now_ns() + VALID_NS
+        task = spawn(self._run(request, since, until_ns), f"request {request.action}")
         self._tasks[request.identifier] = task
         if isinstance(request.action, SetMode | Arm | Disarm | TakeOff):
             self._motion.add(request.identifier)
@@ -115,11 +119,11 @@ class RequestRunner:
             self.cancel(identifier)
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _run(self, request: Request, since: VehicleState) -> None:
+    async def _run(self, request: Request, since: VehicleState, until_ns: int) -> None:
         refused: str | None = None
         taken_over = False
         try:
-            refused = await self._execute(request.action, since)
+            refused = await self._execute(request.action, since, until_ns)
         except (CommandRefusedError, LinkError) as error:
             refused = str(error) or type(error).__name__
             taken_over = isinstance(error, TakenOverError)
@@ -130,16 +134,16 @@ class RequestRunner:
         self._answers.append(Answer(request.identifier, refused, taken_over))
         self._on_answer()
 
-    async def _execute(self, action: Action, since: VehicleState) -> str | None:
+    async def _execute(self, action: Action, since: VehicleState, until_ns: int) -> str | None:
         match action:
             case SetMode(mode):
-                await self._driver.set_mode(mode, since=since)
+                await self._driver.set_mode(mode, since=since, valid_until_ns=until_ns)
             case Arm():
-                await self._driver.arm(since=since)
+                await self._driver.arm(since=since, valid_until_ns=until_ns)
             case Disarm():
-                await self._driver.disarm()
+                await self._driver.disarm(since=since, valid_until_ns=until_ns)
             case TakeOff(altitude_m):
-                await self._driver.takeoff(altitude_m, since=since)
+                await self._driver.takeoff(altitude_m, since=since, valid_until_ns=until_ns)
             case FindGimbal():
                 return None if await self._driver.find_gimbal() else "gimbal manager not responding"
             case TakeGimbal():

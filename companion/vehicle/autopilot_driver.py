@@ -94,7 +94,13 @@ class AutopilotDriver(ABC):
         self._started_ns = time.monotonic_ns()
         self._telemetry = TelemetryState(url, self._warn_other_autopilot, range_finder_height)
         self._flight_commands = FlightCommands(
-            url, self._telemetry, self._command, self._send_once, self._ack_is_ours, self._no_answer
+            url,
+            self._telemetry,
+            self._command,
+            self._send_once,
+            self._ack_is_ours,
+            self._no_answer,
+            lambda: self.watch.now_ns(),
         )
         self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command, self.own_address)
         self._command_locks: dict[int, asyncio.Lock] = {}
@@ -279,6 +285,10 @@ class AutopilotDriver(ABC):
                 ours.append(frame)
         if ours and self._autopilot_kind in self.supported_autopilots:
             self._on_frames(ours)
+
+    def abandon(self, why: str) -> None:
+        """See Driver."""
+        self._flight_commands.abandon(why)
 
     def discard_received(self) -> None:
         """See Driver. The autopilot's heartbeat counts as lost until the next one."""
@@ -521,10 +531,12 @@ class AutopilotDriver(ABC):
             True, self._system_id, since=since, valid_until_ns=valid_until_ns
         )
 
-    async def disarm(self) -> None:
+    async def disarm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
         """See Driver."""
         self._check_flown("disarm")
-        await self._flight_commands.arm_or_disarm(False, self._system_id)
+        await self._flight_commands.arm_or_disarm(
+            False, self._system_id, since=since, valid_until_ns=valid_until_ns
+        )
 
     async def set_mode(
         self,

@@ -73,6 +73,9 @@ class Driver(Protocol):
         The loop that steers acknowledges at the end of its steps.
         """
 
+    def abandon(self, why: str) -> None:
+        """End what is pending of arming, modes and take-off: nothing of it is sent or repeated any more."""
+
     def discard_received(self) -> None:
         """What was received is outdated, also what waits in the link's buffers: the state has no stamps."""
 
@@ -97,11 +100,11 @@ class Driver(Protocol):
         Args:
             since: the state that it was decided on; with another mode or arming now, nothing is sent. None:
                 the present one.
-            valid_until_ns: nothing is sent after it, CLOCK_MONOTONIC; None: no limit.
+            valid_until_ns: nothing is sent or repeated after it, by the clock of `watch`; None: no limit.
         """
 
-    async def disarm(self) -> None:
-        """Disarm (never forced in the air), and return when reported. Raises CommandRefusedError."""
+    async def disarm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
+        """Disarm (never forced in the air), and return when reported. Arguments and errors as `arm`."""
 
     async def set_mode(
         self,

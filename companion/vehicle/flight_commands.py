@@ -50,6 +50,7 @@ class FlightCommands:
             link.
         ack_is_ours: whether a COMMAND_ACK with these fields is addressed to us.
         no_answer: builds the error for a command without an answer.
+        clock_ns: of the driver's `watch`: it counts a suspend.
     """
 
     def __init__(
@@ -60,12 +61,14 @@ class FlightCommands:
         send: Callable[[int, tuple[float, ...], int], None],
         ack_is_ours: Callable[[Fields], bool],
         no_answer: Callable[[str], CommandRefusedError],
+        clock_ns: Callable[[], int],
     ) -> None:
         self._url, self._telemetry = url, telemetry
         self._command, self._ack_is_ours, self._no_answer = command, ack_is_ours, no_answer
         self._changes = ModeChanges(
             send, lambda custom_mode: telemetry.profile.mode_parameters(custom_mode), self._on_restored
         )
+        self._clock_ns = clock_ns
         self._pending: set[ModeChange] = set()
         self._restoring: set[asyncio.Task[None]] = set()
         telemetry.watch(self._watch)
@@ -73,14 +76,19 @@ class FlightCommands:
     def _watch(self, name: str, fields: Fields) -> None:
         """Pass on what the vehicle sends, in its order of arrival."""
         if name in ("HEARTBEAT", "CURRENT_MODE"):
-            self._changes.on_report(self._telemetry.state, time.monotonic_ns())
+            self._changes.on_report(self._telemetry.state, self._clock_ns())
         elif name == "COMMAND_ACK" and self._ack_is_ours(fields):
-            self._changes.on_acknowledgement(fields["command"], fields["result"], time.monotonic_ns())
+            self._changes.on_acknowledgement(fields["command"], fields["result"], self._clock_ns())
+
+    def abandon(self, why: str) -> None:
+        """End what is pending, and watch no more for its effect."""
+        for change in list(self._pending):
+            self._changes.drop(change, f"{change.what}: {why}")
+        self._changes.forget()
 
     async def close(self) -> None:
         """End what is pending."""
-        for change in self._pending:
-            self._changes.drop(change, f"{self._url}: the link was closed before an answer was received")
+        self.abandon(f"{self._url}: the link was closed before an answer was received")
         for task in self._restoring:
             task.cancel()
         await asyncio.gather(*self._restoring, return_exceptions=True)
@@ -90,7 +98,7 @@ class FlightCommands:
         telemetry = self._telemetry
 
         def settled() -> bool:
-            return self._changes.settled(time.monotonic_ns(), telemetry.answered_ns)
+            return self._changes.settled(self._clock_ns(), telemetry.answered_ns)
 
         while not await telemetry.until(settled, _TICK_S):
             pass
@@ -106,7 +114,7 @@ class FlightCommands:
     async def _change(self, change: ModeChange) -> None:
         """Request a change until it ends. Raises CommandRefusedError, except for a rejection."""
         telemetry = self._telemetry
-        self._changes.begin(change, telemetry.state, time.monotonic_ns())
+        self._changes.begin(change, telemetry.state, self._clock_ns())
         await self._follow(change)
         if change.ending is Ending.NO_ANSWER:
             raise self._no_answer(change.why)
@@ -121,7 +129,7 @@ class FlightCommands:
         self._pending.add(change)
         try:
             while not await telemetry.until(lambda: change.ending is not None, _TICK_S):
-                now_ns = time.monotonic_ns()
+                now_ns = self._clock_ns()
                 if telemetry.restart_count != boots or not telemetry.state.connected(now_ns):
                     self._changes.drop(change, f"{change.what}: the autopilot has restarted or is silent")
                 self._changes.tick(now_ns, telemetry.answered_ns)
@@ -139,7 +147,7 @@ class FlightCommands:
     ) -> None:
         """Arm or disarm, and return when the vehicle reports it. `system_id`: for messages."""
         telemetry = self._telemetry
-        if armed and telemetry.two_autopilots(time.monotonic_ns()):
+        if armed and telemetry.two_autopilots(self._clock_ns()):
             raise CommandRefusedError(
                 f"{self._url}: two autopilots answer as system {system_id}: arming refused; "
                 "set a unique MAV_SYS_ID on each"

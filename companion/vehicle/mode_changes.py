@@ -66,7 +66,7 @@ class ModeChange:
         armed: for arming, what it leads to.
         done_by_acknowledgement: else by the report.
         timeout_s: for the report.
-        valid_until_ns: nothing is sent after it; None: no limit.
+        valid_until_ns: nothing is sent or repeated after it; None: no limit.
         ending: None while it is pending. why: in words, unless it is done.
         result: MAV_RESULT of a rejection.
     """
@@ -152,6 +152,10 @@ class ModeChanges:
         now = self._reported
         if now is not None and now.custom_mode != change.before.custom_mode and change.shows_before(now):
             change.other = now  # the end of a take-off, or else a pilot's hold
+
+    def forget(self) -> None:
+        """The newest change, which has ended, is not watched any more."""
+        self._newest = None
 
     def settled(self, now_ns: int, answered_ns: int) -> bool:
         """Whether nothing is pending, and no message of ours can arrive after another's change."""

@@ -92,6 +92,7 @@ class LoopHarness:
             SimpleNamespace(
                 state=self.harness.autopilot.state,
                 watch=self.watch,
+                abandon=lambda why: self.discarded.append("pending"),
                 discard_received=lambda: self.discarded.append("driver"),
                 send_landing_target=None,
                 send_obstacle_distance=None,
@@ -194,7 +195,7 @@ async def test_suspend_ends_the_command_and_discards_what_was_received(loop: Loo
     at_ns = loop.vehicle.now_ns
     loop.suspended_ns = 42_000_000_000
     await loop.run(2.0)
-    assert loop.discarded == ["driver", "inputs"]
+    assert loop.discarded == ["pending", "driver", "inputs"]
     assert [sent_ns for sent_ns, _ in loop.sent if sent_ns > at_ns] == []
     assert not loop.harness.guidance.in_command
     assert "suspended for 42.0 s" in loop.events[0]

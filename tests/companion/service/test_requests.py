@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import cast
 
+from companion.clock import StandstillWatch
 from companion.guidance.interface import Arm, FindGimbal, Request, SetMode
 from companion.service.requests import RequestRunner
 from companion.vehicle.driver import CommandRefusedError, Driver
@@ -18,15 +19,16 @@ class FakeDriver:
 
     def __init__(self, fault: BaseException | None = None) -> None:
         self.fault = fault
+        self.watch = StandstillWatch()
         self.asked: list[str] = []
 
-    async def set_mode(self, mode: FlightMode, *, since: VehicleState) -> None:
+    async def set_mode(self, mode: FlightMode, *, since: VehicleState, valid_until_ns: int) -> None:
         self.asked.append(mode.value)
         if self.fault is not None:
             raise self.fault
         await asyncio.Event().wait()
 
-    async def arm(self, *, since: VehicleState) -> None:
+    async def arm(self, *, since: VehicleState, valid_until_ns: int) -> None:
         self.asked.append("arm")
 
     async def find_gimbal(self) -> bool:

@@ -79,7 +79,6 @@ async def test_no_command_starts_after_a_suspend(driver: Driver, autopilot: Fake
     assert commands(autopilot) == []
 
 
-@pytest.mark.parametrize("kind", ["pymavlink"], indirect=True)
 async def test_pending_arming_is_not_repeated_after_a_suspend(
     driver: Driver, autopilot: FakeAutopilot
 ) -> None:
@@ -93,7 +92,7 @@ async def test_pending_arming_is_not_repeated_after_a_suspend(
     suspend.acknowledge()
     with contextlib.suppress(asyncio.CancelledError, CommandRefusedError):
         await arming
-    await asyncio.sleep(1.2)  # MAVSDK would repeat by itself
+    await asyncio.sleep(1.2)
     await one_message_later(driver, autopilot)
     assert commands(autopilot) == [ARM]
 
@@ -119,3 +118,36 @@ async def test_what_waits_in_the_socket_is_discarded(driver: Driver, autopilot: 
     await one_message_later(driver, autopilot)
     assert driver.state.mode is FlightMode.HOLD
     assert driver.state.heartbeat_ns == 0
+
+
+async def test_expired_request_is_not_sent(driver: Driver, autopilot: FakeAutopilot) -> None:
+    suspend = Suspend(driver)
+    until_ns = suspend.watch.now_ns() + 1_000_000_000
+    suspend.seconds = 0.2  # no standstill, but it counts
+    for request in (driver.arm, driver.disarm):
+        with pytest.raises(CommandRefusedError):
+            await request(valid_until_ns=until_ns - 900_000_000)
+    with pytest.raises(CommandRefusedError):
+        await driver.set_mode(FlightMode.OFFBOARD, valid_until_ns=until_ns - 900_000_000)
+    await one_message_later(driver, autopilot)
+    assert commands(autopilot) == []
+
+
+async def test_request_is_not_repeated_after_its_validity(driver: Driver, autopilot: FakeAutopilot) -> None:
+    suspend = Suspend(driver)
+    autopilot.answers["COMMAND_LONG"] = lambda message: None
+    until_ns = suspend.watch.now_ns() + 250_000_000
+    with pytest.raises(CommandRefusedError):
+        await driver.arm(valid_until_ns=until_ns)
+    assert commands(autopilot) == [ARM]
+
+
+async def test_abandoned_request_is_not_repeated(driver: Driver, autopilot: FakeAutopilot) -> None:
+    autopilot.answers["COMMAND_LONG"] = lambda message: None
+    arming = asyncio.create_task(driver.arm())
+    await wait_until(lambda: commands(autopilot) == [ARM], 5.0)
+    driver.abandon("suspended")
+    with pytest.raises(CommandRefusedError, match="suspended"):
+        await arming
+    await asyncio.sleep(1.2)
+    assert commands(autopilot) == [ARM]
