@@ -32,6 +32,9 @@ class ScriptedLink:
     def answer_to(self, source: Source) -> None:
         pass
 
+    def discard_received(self) -> None:
+        pass
+
     async def close(self) -> None:
         pass
 
