@@ -27,12 +27,12 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response, StreamingResponse
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from companion.bus.bodies.vehicle import VelocityBody
 from companion.dashboard.access import COOKIE, Access, DashboardError, ErrorResponse, read_token
 from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
+from companion.dashboard.connections import connection_class, connection_of
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
 from companion.settings import LanguageSection, ZenohSection
 from companion.tasks import spawn
@@ -41,14 +41,11 @@ NICENESS = 5
 """Of the server's process: the loop that steers has priority."""
 STREAM_PERIOD_S = 0.1
 IMAGE_WAIT_S = 0.5
-FIRST_REQUEST_S = 5.0
-"""A connection without a complete request head after this is closed: silent ones would use up the limit."""
 REPLY_WAIT_S = 1.0
 """How long a POST waits for the command's outcome; a later one is only in the stream."""
 ALL = "*"
 """As the vehicle of a `stop`: all."""
 LONGEST_COMMAND, LARGEST_BODY_BYTES = 8000, 64 * 1024
-MAX_CONNECTIONS = 100
 MAX_STREAMS_PER_BROWSER = 2
 """A browser opens 6 connections to one host. One window uses a stream and 2 for images, each of two windows
 a stream and 1, so that a stop command has one at once."""
@@ -82,18 +79,6 @@ class DashboardOptions:
     vehicle: str
     language: LanguageSection = field(default_factory=LanguageSection)
     plugins: tuple[str, ...] = ()
-
-
-class _Connection(H11Protocol):
-    """A connection that must ask for something."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        self.loop.call_later(FIRST_REQUEST_S, self._close_if_silent)
-
-    def _close_if_silent(self) -> None:
-        if self.cycle is None:
-            self.transport.close()
 
 
 class _Server(uvicorn.Server):
@@ -149,14 +134,13 @@ def http_server(application: ASGIApp) -> uvicorn.Server:
     return _Server(
         uvicorn.Config(
             application,
-            http=_Connection,
+            http=connection_class(),
             ws="none",
             lifespan="off",
             access_log=False,
             log_config=None,  # its own would close the handlers of the whole process
             log_level="critical",
             server_header=False,
-            limit_concurrency=MAX_CONNECTIONS,
             timeout_graceful_shutdown=1,
         )
     )
@@ -431,10 +415,18 @@ class Guard:
                 message = {**message, "headers": [*message.get("headers", []), *extra]}
             await send(message)
 
-        if error is None:
-            await self._application(scope, receive, send_secured)
-        else:
+        if error is not None:
             await PlainTextResponse(f"{error.text}\n", error.status)(scope, receive, send_secured)
+            return
+        connection = connection_of(scope)
+        if not connection.table.admit(connection, short=scope["method"] == "POST"):
+            answer = PlainTextResponse("too many requests are being answered: close other windows\n", 503)
+            await answer(scope, receive, send_secured)
+            return
+        try:
+            await self._application(scope, receive, send_secured)
+        finally:
+            connection.table.end(connection)
 
     def _check(self, request: Request) -> ErrorResponse | None:
         headers = _joined(request.headers)

@@ -7,15 +7,18 @@ import gc
 import json
 import socket
 import tracemalloc
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from companion import dashboard
 from companion.bus.topics import DETECTIONS, VEHICLE, command_key
 from companion.dashboard.access import COOKIE, DashboardError
-from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_CONNECTIONS, MAX_STREAMS_PER_BROWSER
+from companion.dashboard.connections import MAX_ANSWERED
+from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_STREAMS_PER_BROWSER
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
 
@@ -276,14 +279,90 @@ async def test_browser_that_reads_nothing_costs_no_memory() -> None:
             dead.close()
 
 
-async def test_silent_connections_do_not_use_up_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.dashboard.server.FIRST_REQUEST_S", 1.0)
+HEAD = b"GET / HT"
+BODY = b"POST /command HTTP/1.1\r\nHost: 127.0.0.1\r\nx-companion-dashboard: 1\r\nContent-Length: 40\r\n\r\n{"
+WEBSOCKET = b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n\r\n"
+IDLE = b"GET /clock HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+STREAM = b"GET /events HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+HELD = 200
+
+
+@pytest.mark.parametrize("token", [False, True])
+@pytest.mark.parametrize(
+    "sent",
+    [b"", HEAD, BODY, WEBSOCKET, IDLE, STREAM],
+    ids=["silent", "head", "body", "websocket", "idle", "stream"],
+)
+async def test_stop_is_answered_while_others_hold_connections(
+    tmp_path: Path, sent: bytes, token: bool
+) -> None:
+    path = tmp_path / "token"
+    path.write_text(TOKEN)
+    path.chmod(0o600)
+    headers = {**POST, "authorization": f"Bearer {TOKEN}"}
+    with publishing() as (service, endpoint), ExitStack() as held:
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                query.reply(query.key_expr, json.dumps({"success": True, "reason": "stopped"}))
+
+        service.session.declare_queryable(command_key(NAME), answer)
+        async with serving(endpoint, token_file=path if token else None) as port:
+            body = {"text": "stop", "id": "1"}
+            while (await request(port, "POST", "/command", headers, body))[0] not in (200, 202):
+                pass  # until the server has found the service
+            for number in range(HELD):
+                connection = held.enter_context(socket.create_connection(("127.0.0.1", port)))
+                connection.sendall(sent)
+                if number % 50 == 49:
+                    assert (await request(port, "POST", "/command", headers, body))[0] in (200, 202)
+
+
+async def test_request_that_does_not_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.dashboard.connections.REQUEST_S", 0.5)
     async with serving() as port:
-        silent = [socket.create_connection(("127.0.0.1", port)) for _ in range(MAX_CONNECTIONS)]
-        silent[0].sendall(b"GET / HT")  # half a request is none
-        assert (await request(port, "GET", "/clock"))[0] == 503
-        for connection in silent:
-            connection.settimeout(10.0)
-            assert await asyncio.to_thread(connection.recv, 1) == b""
-            connection.close()
-        assert (await request(port, "GET", "/clock"))[0] == 200
+        for sent in (b"", HEAD, BODY, IDLE + HEAD):
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(sent)
+            if sent.startswith(IDLE):
+                await reader.readuntil(b"}")
+            async with asyncio.timeout(20):
+                with suppress(ConnectionError):
+                    while True:  # one byte now and then does not extend it
+                        writer.write(b"x" if sent else b"")
+                        try:
+                            async with asyncio.timeout(0.1):
+                                if not await reader.read(100):
+                                    break
+                        except TimeoutError:
+                            continue
+            writer.close()
+
+
+async def test_strangers_leave_the_streams_of_others_alone(tmp_path: Path) -> None:
+    path = tmp_path / "token"
+    path.write_text(TOKEN)
+    path.chmod(0o600)
+    admitted = STREAM.replace(b"\r\n\r\n", f"\r\nAuthorization: Bearer {TOKEN}\r\n\r\n".encode())
+    async with serving(token_file=path) as port:
+        with ExitStack() as held:
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(admitted)
+            await reader.readuntil(b"data: ")
+            for _ in range(HELD):
+                held.enter_context(socket.create_connection(("127.0.0.1", port))).sendall(HEAD)
+            for _ in range(3):
+                await reader.readuntil(b"data: ")
+            writer.close()
+
+
+async def test_too_many_streams_are_refused_and_end() -> None:
+    async with serving() as port:
+        with ExitStack() as held:
+            for number in range(MAX_ANSWERED):
+                connection = held.enter_context(socket.create_connection(("127.0.0.1", port)))
+                connection.sendall(STREAM.replace(b"/events", b"/events?browser=%d" % number))
+                assert await asyncio.to_thread(connection.recv, 12) == b"HTTP/1.1 200"
+            assert (await request(port, "GET", "/clock"))[0] == 503
+        while (await request(port, "GET", "/clock"))[0] != 200:
+            pass

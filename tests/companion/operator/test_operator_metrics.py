@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
-from companion.operator.metrics import MetricsError, MetricsServer
+from companion.operator.metrics import MAX_CONNECTIONS, MetricsError, MetricsServer
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
 
@@ -110,3 +110,20 @@ def test_stalled_scraper_does_not_block_others() -> None:
         closing.start()
         closing.join(5.0)
         assert not closing.is_alive()
+
+
+def test_scrape_is_answered_while_others_hold_connections() -> None:
+    server = MetricsServer("127.0.0.1:0", lambda: None)
+    held: list[socket.socket] = []
+    try:
+        before = threading.active_count()
+        for _ in range(200):
+            held.append(socket.create_connection(("127.0.0.1", server.port)))
+            held[-1].sendall(b"GET / HT")
+        fetch(server.port)
+        while threading.active_count() > before + 2 * MAX_CONNECTIONS:
+            fetch(server.port)  # those that were closed are ending
+    finally:
+        for connection in held:
+            connection.close()
+        server.close()
