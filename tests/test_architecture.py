@@ -20,6 +20,7 @@ COMPANION_LAYERS = {
     "plugins": 0,
     "scheduling": 0,
     "tasks": 0,
+    "toml_text": 0,
     "settings": 1,
     "vehicle": 2,
     "relay": 3,

@@ -12,7 +12,7 @@ from companion.bus.command_intake import Allowance
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.select import Select
 from companion.guidance.behaviours.stop import StopBehaviour
-from companion.guidance.command import GrammarError
+from companion.guidance.command import COMMANDS, GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.guidance.missions.sequence import SequenceBehaviour
 from vision.tracking import Selected
@@ -22,6 +22,8 @@ from vision.tracking import Selected
 REPORTED_PER_S, REPORTED_AT_ONCE = 1.0, 20
 # A command that is not reported at once is reported when it has lasted this long.
 LASTING_S = 1.0
+# A mission of 100 kB takes up to 0.5 s.
+READING_S = 5.0
 
 
 class CommandHandler:
@@ -54,12 +56,14 @@ class CommandHandler:
         self._awaited: dict[int, asyncio.Future[Outcome]] = {}
         self._reported, self._stops_reported = (Allowance(REPORTED_PER_S, REPORTED_AT_ONCE) for _ in range(2))
         self._unreported = 0
+        self._reading = self._closed = False
+        self._newest = 0
         self._succeeded: CommandInput | None = None
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command and return its result. See `Service.command`."""
         try:
-            command = self._read(next(self._identifiers), text)
+            command = await self._parse(next(self._identifiers), text)
         except GrammarError as error:
             first_line = text.strip().partition("\n")[0]
             return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
@@ -76,6 +80,7 @@ class CommandHandler:
                 self._on_event("warning", f"{command.text}: {reason}")
             return {"command": command.text, "success": False, "reason": reason}
         ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
+        self._newest = max(self._newest, command.identifier)
         self._awaited[command.identifier] = ended
         self._new.append(command)
         self._on_command()
@@ -98,6 +103,30 @@ class CommandHandler:
                 asyncio.get_running_loop().call_later(LASTING_S, self._report_lasting, command, outcome)
         answer = {"success": outcome.success, "reason": outcome.reason}
         return {"command": command.text, **answer, **more}
+
+    async def _parse(self, identifier: int, text: str) -> CommandInput | Select:
+        """Parse a command; one with a file in a thread, since that may take longer than the loop may wait.
+
+        Raises:
+            GrammarError: it is not valid, or a newer command came while its file was read.
+        """
+        word = text.split(maxsplit=1)[:1]
+        kind = COMMANDS.get(word[0].lower()) if word else None
+        if kind is None or not kind.takes_attachment:
+            return self._read(identifier, text)
+        if self._reading:
+            raise GrammarError(f"{kind.word}: another file is being read")
+        self._reading = True
+        try:
+            async with asyncio.timeout(READING_S):
+                command = await asyncio.to_thread(self._read, identifier, text)
+        except TimeoutError:
+            raise GrammarError(f"{kind.word}: its file was not read within {READING_S:g} s") from None
+        finally:
+            self._reading = False
+        if self._newest > identifier or self._closed:
+            raise GrammarError(f"{kind.word}: superseded while its file was read")
+        return command
 
     def _report(self, command: CommandInput) -> None:
         before, self._unreported = self._unreported, 0
@@ -132,6 +161,6 @@ class CommandHandler:
 
     def close(self, reason: str) -> None:
         """Fail every command that is still pending."""
-        self._succeeded = None
+        self._succeeded, self._closed = None, True
         for identifier in list(self._awaited):
             self.on_result(CommandResult(identifier, Outcome(False, reason)))

@@ -199,6 +199,7 @@ class InputAssembler:
         Raises:
             GrammarError: one line for each problem.
         """
+        mode_changes = self._mode_changes  # before the rest, which takes time
         text, _, enclosed = text.strip().partition("\n")
         if len(text) > LONGEST_LINE:
             raise GrammarError(f"a command line has at most {LONGEST_LINE} characters, got {len(text)}")
@@ -209,7 +210,7 @@ class InputAssembler:
         if isinstance(command, Select):
             return command
         if (aim := command.aim) is not None:
-            return CommandInput(identifier, str(command), aim=aim, mode_changes=self._mode_changes)
+            return CommandInput(identifier, str(command), aim=aim, mode_changes=mode_changes)
         footprint = Footprint(self.steering.settings.camera.field_rad, -self.camera_pitch_rad(state))
         source = CommandSource(enclosed if enclosed.strip() else command.read_attachment(), footprint, names)
         rate_hz = self._settings.guidance.rate_hz
@@ -219,7 +220,7 @@ class InputAssembler:
             str(command),
             self._built(command, context),
             endless=command.endless,
-            mode_changes=self._mode_changes,
+            mode_changes=mode_changes,
             source=source,
         )
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from companion.toml_text import parse_toml
 from vision.marker_boards import MAP, Board, ned_from_marker
 from vision.markers import square
 from vision.rotation import matrix_from_euler
@@ -133,7 +134,7 @@ def _board(
 
 def _read(path: str | Path, kind: type[_Kind]) -> _Kind:
     try:
-        content: dict[str, Any] = tomllib.loads(Path(path).read_bytes().decode("utf-8"))
+        content: dict[str, Any] = parse_toml(Path(path).read_bytes().decode("utf-8"))
     except OSError as error:
         raise BoardError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -31,6 +31,7 @@ from companion.settings.fields import (
 )
 from companion.settings.section import Section
 from companion.settings.settings import Settings
+from companion.toml_text import parse_toml
 
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
 
@@ -282,7 +283,7 @@ class _Reading:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_bytes().decode("utf-8"))
+        return parse_toml(path.read_bytes().decode("utf-8"))
     except OSError as error:
         raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -238,8 +238,10 @@ def parse_scene(text: str, origin: str = "scene") -> Scene:
     """The scene of a text; `origin` names it in messages. Raises SceneError."""
     try:
         content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise SceneError(f"{origin}: {error}") from error
+    except RecursionError:
+        raise SceneError(f"{origin}: nested too deeply") from None
+    except ValueError as error:  # not TOML, or an integer of too many digits
+        raise SceneError(f"{origin}: {str(error).partition(';')[0]}") from error
     try:
         file = _File.model_validate(content)
     except ValidationError as error:

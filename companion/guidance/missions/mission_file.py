@@ -47,6 +47,7 @@ from companion.guidance.missions.sequence import (
     SequenceBehaviour,
 )
 from companion.guidance.search_pattern import Footprint
+from companion.toml_text import parse_toml
 
 MISSIONS_FOLDER = Path(__file__).parent
 LARGEST_BYTES = 100_000
@@ -171,7 +172,7 @@ def plan_from(
             class or step, an unreachable step, a loop without exit.
     """
     try:
-        written = tomllib.loads(text)
+        written = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         raise MissionError(f"{source}: invalid TOML: {error}") from error
     problems: list[str] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from companion.bus.command_intake import Allowance
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.behaviours.select import Select
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.service import command_handler
@@ -106,3 +108,50 @@ async def test_stop_in_a_flood_is_logged_at_once() -> None:
     handler.on_result(CommandResult(identifier, Outcome(True, "holding")))
     assert (await answer)["success"]
     assert handler.lines[before + 1 :] == ["stop: holding"]
+
+
+class ReadingHandler(Handler):
+    """A handler whose missions are read until `release` is set. `threads`: where each command was read."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.release, self.begun = threading.Event(), threading.Event()
+        self.threads: dict[str, str] = {}
+        read = self._read
+
+        def slow(identifier: int, text: str) -> CommandInput | Select:
+            self.threads[text.split()[0]] = threading.current_thread().name
+            if text.startswith("mission"):
+                self.begun.set()
+                assert self.release.wait(20)
+            return read(identifier, text)
+
+        self._read = slow
+
+
+async def test_mission_is_read_outside_the_loop_and_a_stop_wins() -> None:
+    handler = ReadingHandler()
+    mission = asyncio.create_task(handler.execute("mission far"))
+    await asyncio.to_thread(handler.begun.wait, 20)
+    stop, stopping = await handler.until_started("stop")  # the loop goes on
+    assert not (await handler.execute("mission other"))["success"]  # one at a time
+    handler.release.set()
+    assert not (await mission)["success"]
+    assert handler.take_commands() == ()  # the mission is not flown after the stop
+    handler.on_result(CommandResult(stop, Outcome(True, "stopped")))
+    assert (await stopping)["success"]
+    assert handler.threads["stop"] == threading.main_thread().name
+    assert handler.threads["mission"] != threading.main_thread().name
+    identifier, flying = await handler.until_started("mission far")
+    handler.on_result(CommandResult(identifier, Outcome(True, "done")))
+    assert (await flying)["success"]
+
+
+async def test_mission_that_is_read_at_the_end_is_not_flown() -> None:
+    handler = ReadingHandler()
+    mission = asyncio.create_task(handler.execute("mission far"))
+    await asyncio.to_thread(handler.begun.wait, 20)
+    handler.close("the service ends")
+    handler.release.set()
+    assert not (await mission)["success"]
+    assert handler.take_commands() == ()
