@@ -384,6 +384,24 @@ def test_every_part_is_in_the_document(package: str) -> None:
     assert not sorted(name for name in names if name not in document)
 
 
+def test_an_assert_only_tells_the_type_checker() -> None:
+    """`python -O` removes it, so it must not check what may come: only what the code itself has made sure."""
+    for package in ("companion", "vision", "mavlink_sim"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Assert):
+                    assert _narrows(node.test), f"{path.relative_to(ROOT)}:{node.lineno}"
+
+
+def _narrows(test: ast.expr) -> bool:
+    if isinstance(test, ast.UnaryOp) and isinstance(test.op, ast.Not):
+        return _narrows(test.operand)
+    if isinstance(test, ast.Call) and isinstance(test.func, ast.Name):
+        return test.func.id in ("isinstance", "issubclass")
+    is_none = isinstance(test, ast.Compare) and isinstance(test.comparators[0], ast.Constant)
+    return is_none and isinstance(test, ast.Compare) and isinstance(test.ops[0], ast.Is | ast.IsNot)
+
+
 def test_no_background_task_ends_unseen() -> None:
     starts = {"create_task", "ensure_future"}
     found = set()

@@ -238,8 +238,8 @@ class VideoWriter:
             raise VideoWriterError(f"{self.path}: rate_hz must be 0.1..240, got {rate_hz}")
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("wb"):
-                pass
+            # Readable by its owner alone; the encoder opens it again. An older file keeps its mode.
+            os.close(os.open(self.path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600))
             self._encoder = open_encoder(self.path, width, height, rate_hz)
         except OSError as error:
             raise self._write_error(error) from error

@@ -8,12 +8,17 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 
+if TYPE_CHECKING:
+    import httpx
+
 MAX_ANSWER_CHARACTERS = 20_000
+MAX_ANSWER_BYTES = 8 * 1024 * 1024
+"""Of a whole response, with all that a server may write around the characters."""
 OLLAMA_CONTEXT_TOKENS = 8192
 """The prompt and the functions take some 5400 tokens with 80 classes; Ollama keeps 4096 by default."""
 
@@ -239,9 +244,39 @@ def _status_text(error: Any, endpoint: OllamaEndpoint | OpenAIEndpoint, advice: 
 
 def _options(endpoint: OllamaEndpoint | OpenAIEndpoint) -> dict[str, Any]:
     """Options of httpx's client. Without https the certificates, which take 0.1 s, are not loaded."""
-    headers = {} if endpoint.key is None else {"Authorization": f"Bearer {endpoint.key}"}
-    verify = endpoint.url.startswith("https:")
-    return {"headers": headers, "timeout": endpoint.timeout_s, "verify": verify, "follow_redirects": False}
+    headers = {"Accept-Encoding": "identity"}  # what is unpacked could not be limited
+    if endpoint.key is not None:
+        headers["Authorization"] = f"Bearer {endpoint.key}"
+    return {
+        "headers": headers,
+        "timeout": endpoint.timeout_s,
+        "verify": endpoint.url.startswith("https:"),
+        "follow_redirects": False,
+        "event_hooks": {"response": [_limit]},
+    }
+
+
+async def _limit(response: httpx.Response) -> None:
+    """Limit what is read of a response: a line without an end would be collected whole."""
+    import httpx
+
+    if response.headers.get("content-encoding", "identity") != "identity":
+        raise LanguageError(f"{response.url}: the answer is compressed, which was not asked for")
+    stream = response.stream
+
+    class Limited(httpx.AsyncByteStream):
+        async def __aiter__(self) -> AsyncIterator[bytes]:
+            received = 0
+            async for chunk in cast(httpx.AsyncByteStream, stream):
+                received += len(chunk)
+                if received > MAX_ANSWER_BYTES:
+                    raise LanguageError(f"the model's answer has more than {MAX_ANSWER_BYTES} bytes")
+                yield chunk
+
+        async def aclose(self) -> None:
+            await cast(httpx.AsyncByteStream, stream).aclose()
+
+    response.stream = Limited()
 
 
 def _for_ollama(message: Message) -> dict[str, Any]:

@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import http.client
 import os
+import stat
 import urllib.error
 import urllib.parse
 import urllib.request
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import BinaryIO
 
 from vision.catalog import KnownModel
 from vision.yolo.checkpoint_pair import file_sha256
@@ -58,6 +61,7 @@ def pull(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         partial = target.with_name(f"{target.name}.partial")
+        _remove_foreign(partial)
         _fetch_all(model, target, partial, progress)
         found = file_sha256(partial)
         if found != model.sha256:
@@ -71,6 +75,20 @@ def pull(
     except OSError as error:
         raise PullError(f"{error.filename or folder}: {error.strerror or error}") from error
     return Pulled(target, found, fetched=True)
+
+
+def _remove_foreign(partial: Path) -> None:
+    """Remove what is not an interrupted download: a link would be followed to a file of somebody else."""
+    with suppress(FileNotFoundError):
+        status = partial.lstat()
+        if not stat.S_ISREG(status.st_mode) or status.st_nlink != 1:
+            partial.unlink()
+
+
+def _open_partial(partial: Path, had: int) -> BinaryIO:
+    """Open the file to write after `had` bytes; never through a link."""
+    flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC | (0 if had else os.O_TRUNC)
+    return os.fdopen(os.open(partial, flags, 0o644), "r+b")
 
 
 def manual_instructions(model: KnownModel, target: Path) -> str:
@@ -142,7 +160,7 @@ def _fetch(model: KnownModel, partial: Path, progress: Progress) -> bool:
         if total is not None and total != model.size_bytes:
             raise PullError(f"{model.url}: {total} bytes, expected {model.size_bytes}: another file")
         done = had
-        with partial.open("r+b" if had else "wb") as file:
+        with _open_partial(partial, had) as file:
             file.seek(had)
             progress(done, total)
             while chunk := response.read(_CHUNK_BYTES):

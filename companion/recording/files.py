@@ -27,6 +27,8 @@ PROFILE = "companion"
 CHUNK_BYTES = 1 << 20
 # A chunk is written at least this often: what a crash or a cut loses.
 FLUSH_S = 1.0
+PRIVATE, PRIVATE_FOLDER = 0o600, 0o700
+"""Modes of what is made: images and positions are for its owner."""
 _HEADER_BYTES = 9  # opcode and length of a record
 _LARGEST_RECORD_BYTES = 1 << 30
 # Of our own files: only these are removed for space.
@@ -79,7 +81,7 @@ class RecordingWriter:
         self._part = 0
         self.begins: dict[str, Recorded] = {}
         try:
-            directory.mkdir(parents=True, exist_ok=True)
+            directory.mkdir(PRIVATE_FOLDER, parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{directory}: the folder cannot be made: {error.strerror}") from error
         self._open()
@@ -177,7 +179,7 @@ class _File:
     """An unbuffered file: nothing is left to be written when a write has failed."""
 
     def __init__(self, path: Path) -> None:
-        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, PRIVATE)
         self.size = 0
 
     def write(self, data: bytes) -> int:
@@ -323,6 +325,10 @@ def write_messages(
     return count
 
 
+def _private(path: str, flags: int) -> int:
+    return os.open(path, flags, PRIVATE)
+
+
 @contextlib.contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
     """Open a new file; it is removed if the block raises.
@@ -331,7 +337,7 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
         RecordingError: the file exists or cannot be written.
     """
     try:
-        with path.open("xb") as file:
+        with open(path, "xb", opener=_private) as file:
             try:
                 yield file
                 file.flush()

@@ -15,7 +15,7 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.grammar import json_schema, parse
 from companion.language.control import CommandEvents, Control
 from companion.language.conversation import MAX_TURNS, Conversation, Operator, plan_of
-from companion.language.endpoints import LanguageError, endpoint_of
+from companion.language.endpoints import MAX_ANSWER_BYTES, LanguageError, Message, endpoint_of
 from companion.language.scene import Scene, SceneObject
 from companion.language.tools import ToolCall, calls_in, class_names_of, read_call, tools_of
 from mavlink_sim.testing import free_port
@@ -718,3 +718,30 @@ async def test_models_plan_is_flown_by_the_simulated_vehicle() -> None:
     # The envelope, not the model, decides how far it goes.
     assert second["success"] is False
     assert "200" in second["reason"]
+
+
+@pytest.mark.parametrize("path", ["", "/v1"])
+@pytest.mark.parametrize("compressed", [False, True])
+async def test_answer_without_line_ends_is_limited(path: str, compressed: bool) -> None:
+    chunk = b"x" * (1 << 20)
+    endless = response([chunk] * 12, "text/event-stream", cut=True)
+    if compressed:
+        endless = endless.replace(b"\r\n", b"\r\nContent-Encoding: gzip\r\n", 1)
+    async with serving(endless) as script:
+        endpoint = endpoint_of(script.url + path, "small")
+        with pytest.raises(LanguageError) as caught:
+            await endpoint.answer([Message("user", "rise")], [], lambda _: None)
+        assert "\n" not in str(caught.value)
+        assert compressed or str(MAX_ANSWER_BYTES) in str(caught.value)
+        assert script.headers["accept-encoding"] == "identity"
+
+
+@pytest.mark.parametrize("path", ["", "/v1"])
+async def test_huge_error_of_a_server_is_limited(path: str) -> None:
+    huge = response([b"x" * (1 << 20)] * 12, "text/plain", status="500 Internal Server Error")
+    async with serving(huge) as script:
+        endpoint = endpoint_of(script.url + path, "small")
+        with pytest.raises(LanguageError) as caught:
+            await endpoint.answer([Message("user", "rise")], [], lambda _: None)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 400

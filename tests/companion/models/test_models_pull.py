@@ -129,6 +129,25 @@ def test_partial_of_another_file_is_replaced(tmp_path: Path, server: Server) -> 
     assert pull(official(server), tmp_path).path.read_bytes() == CONTENT
 
 
+@pytest.mark.parametrize("kind", ["symlink", "dangling", "hard link", "folder link"])
+def test_link_in_the_models_folder_is_not_followed(tmp_path: Path, server: Server, kind: str) -> None:
+    folder, victim = tmp_path / "models", tmp_path / "victim"
+    folder.mkdir()
+    model = official(server)
+    partial = folder / f"{model.file}.partial"
+    if kind != "dangling":
+        victim.write_bytes(b"mine")
+    (partial.hardlink_to if kind == "hard link" else partial.symlink_to)(victim)
+    if kind == "folder link":
+        (folder / model.file).symlink_to(tmp_path / "nowhere")
+    pulled = pull(model, folder)
+    assert pulled.path.read_bytes() == CONTENT
+    assert not pulled.path.is_symlink()
+    assert not partial.exists()
+    assert not (tmp_path / "nowhere").exists()
+    assert (victim.read_bytes() if victim.exists() else None) == (None if kind == "dangling" else b"mine")
+
+
 def test_missing_file_gives_manual_instructions(tmp_path: Path, server: Server) -> None:
     with pytest.raises(PullError, match=f"404.*{tmp_path}/model.pt.*{DIGEST}.*512000"):
         pull(at_address(official(server), server.url.replace("model.pt", "gone.pt")), tmp_path)

@@ -10,12 +10,14 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 
 from companion.recording import RecordingError
 from companion.recording.files import Channel, RecordingReader, recover
 from tests.companion.recording.lockstep_recording import library_times, new_writer
+from vision.video_writer import VideoWriter
 
 NUMBERS = Channel("numbers", "companion.numbers", b'{"type":"object"}')
 RAW = Channel("raw", encoding="mavlink")
@@ -110,6 +112,24 @@ def test_missing_file_and_bad_folder_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(RecordingError, match="file"):
         new_writer(tmp_path / "file" / "folder")
+
+
+def test_recordings_are_readable_by_their_owner_alone(tmp_path: Path, whole: Path) -> None:
+    before = os.umask(0)
+    try:
+        writer = new_writer(tmp_path / "recordings")
+        writer.begin_next()
+        writer.close()
+        recover(whole, tmp_path / "recovered.mcap")
+        video = VideoWriter(tmp_path / "video.webm", 64, 48, 10.0)
+        video.write(np.zeros((48, 64, 3), np.uint8), 0)
+        video.close()
+    finally:
+        os.umask(before)
+    made = [*(tmp_path / "recordings").iterdir(), tmp_path / "recovered.mcap", tmp_path / "video.webm"]
+    assert len(made) == 4
+    assert [path.stat().st_mode & 0o777 for path in made] == [0o600] * 4
+    assert (tmp_path / "recordings").stat().st_mode & 0o777 == 0o700
 
 
 def test_parts_begin_with_the_run_and_the_oldest_are_removed(tmp_path: Path) -> None:
