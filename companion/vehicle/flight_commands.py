@@ -182,13 +182,12 @@ class FlightCommands:
 
     def _checks_since(self, asked_ns: int) -> str:
         state = self._telemetry.state
-        reports = [
+        failing = [
             report
             for report in state.reports
-            if report.stamp_ns >= asked_ns and among_modes(state.mode, report.modes)
+            if report.stamp_ns >= asked_ns and report.is_check and among_modes(state.mode, report.modes)
         ]
-        failing = [report for report in reports if report.is_check]
-        return words_of(failing or [report for report in reports if report.is_listed_check])
+        return words_of(sorted(failing, key=lambda report: report.level))
 
     async def set_mode(
         self,

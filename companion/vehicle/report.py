@@ -10,6 +10,9 @@ WARNING = 4  # MAV_SEVERITY: from 0 (emergency) to 7 (debug)
 # Groups of PX4's events, and prefixes of ArduPilot's and PX4's texts, that report why it cannot arm.
 _CHECK_GROUPS = ("arming_check", "health")
 _CHECK_TEXTS = ("PreArm:", "Arm:", "Preflight Fail:")
+# Reported at level info, and of all modes, although it prevents arming in none: the only one (PX4's source,
+# v1.14 to v1.18). Where NAV_DLL_ACT requires a ground station, it is an error.
+_OPTIONAL_CHECKS = ("check_rc_dl_no_dllink",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,17 +36,14 @@ class Report:
 
     @property
     def is_check(self) -> bool:
-        """Whether it reports why the vehicle cannot arm."""
-        return self.level <= WARNING and (self.group in _CHECK_GROUPS or self.text.startswith(_CHECK_TEXTS))
+        """Whether it reports why the vehicle cannot arm, in any of `modes`.
 
-    @property
-    def is_listed_check(self) -> bool:
-        """Whether it is one of PX4's failing checks, at any level.
-
-        At level info PX4 reports also what prevents arming in all modes: a missing mission (COM_ARM_MIS_REQ),
-        the safety button, an estimator that is not initialized (v1.14 to v1.18, by source).
+        PX4 reports at level info, too, what prevents arming: a missing mission or home position, the safety
+        button, an estimator that is not initialized.
         """
-        return self.group in _CHECK_GROUPS
+        if self.group in _CHECK_GROUPS and self.name not in _OPTIONAL_CHECKS:
+            return True
+        return self.level <= WARNING and (self.group in _CHECK_GROUPS or self.text.startswith(_CHECK_TEXTS))
 
 
 def words_of(reports: Iterable[Report]) -> str:

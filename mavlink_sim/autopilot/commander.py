@@ -141,6 +141,10 @@ class Autopilot:
         return self.supervision.lacks_ground_station
 
     @property
+    def ground_station_lost(self) -> bool:
+        return self.supervision.conditions.ground_station_lost
+
+    @property
     def terminated(self) -> bool:
         """Flight termination: the motors are off until a reboot."""
         return self.supervision.terminated

@@ -79,6 +79,9 @@ class SupervisedAutopilot(Protocol):
     def lacks_ground_station(self) -> bool: ...
 
     @property
+    def ground_station_lost(self) -> bool: ...
+
+    @property
     def requires_mission(self) -> bool: ...
 
     def arm(self, by: str = ...) -> int: ...
@@ -459,6 +462,7 @@ _NO_COMPONENT, _MANUAL_CONTROL, _SYSTEM = 0, 7, 20
 # Pressure, GPS, battery, magnetometer, accelerometer, gyroscope
 _PRESENT = 1 << 1 | 1 << 3 | 1 << 11 | 1 << 27 | 1 << 28 | 1 << 29
 _ALL_MODES = 0xFFFF_FFFF
+_GROUND_STATION_CHECK = "check_rc_dl_no_dllink"
 # PX4's NAVIGATION_STATE of each mode: its bit in the events' `modes`
 NAVIGATION_STATES = {
     Mode.MANUAL: 0,
@@ -492,8 +496,10 @@ def health_report(autopilot: SupervisedAutopilot) -> list[Text]:
     """
     checks = failing_checks(autopilot)
     failing_modes = errors = 0
-    for _, levels, (modes, component) in checks:
-        failing_modes |= modes
+    for name, levels, (modes, component) in checks:
+        # Reported of all modes, as PX4 reports optional checks; it prevents arming in none.
+        optional = name == _GROUND_STATION_CHECK and levels == _INFO
+        failing_modes |= 0 if optional else modes
         errors |= (levels == _ERROR) << component
     unavailable = _bits([mode for mode in Mode if not autopilot.can_run(mode)])
     can_arm, can_run = _ALL_MODES & ~failing_modes, _ALL_MODES & ~unavailable
@@ -511,13 +517,14 @@ def failing_checks(autopilot: SupervisedAutopilot) -> list[tuple[str, int, tuple
     in_wrong_mode = not autopilot.armed and autopilot.mode in MODES_PREVENTING_ARMING
     mission, sticks = autopilot.navigator.mission, autopilot.pilot_has_sticks
     breaches = autopilot.navigator.breaches
-    unlinked = autopilot.lacks_ground_station
+    unlinked = autopilot.ground_station_lost
+    of_link = _ERROR if autopilot.lacks_ground_station else _INFO
     of_missions = None if autopilot.requires_mission else [Mode.MISSION]
     checks = (
         ("check_estimator_heading_not_stable", not autopilot.sensors_ready, _ERROR, None, _NO_COMPONENT),
         ("check_modes_local_pos", not autopilot.position_valid, _ERROR, with_position, _NO_COMPONENT),
         *((name, words in breaches, _ERROR, None, _SYSTEM) for name, words in GEOFENCE_CHECKS.items()),
-        ("check_rc_dl_no_dllink", unlinked, _ERROR, None, _NO_COMPONENT),
+        (_GROUND_STATION_CHECK, unlinked, of_link, None, _NO_COMPONENT),
         ("check_modes_mission", not mission.valid, _INFO, of_missions, _SYSTEM),
         ("check_modes_offboard_signal", not autopilot.has_setpoints, _ERROR, [Mode.OFFBOARD], _SYSTEM),
         ("check_modes_manual_control", not sticks, _ERROR, MANUAL_MODES, _MANUAL_CONTROL),

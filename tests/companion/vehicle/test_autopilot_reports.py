@@ -45,7 +45,7 @@ async def test_denied_arming_of_px4_has_its_reason(
 
 
 @pytest.mark.parametrize("release", RELEASES)
-async def test_check_of_level_info_is_the_reason_if_it_is_the_only_one(
+async def test_check_of_level_info_is_the_reason_of_every_release(
     release: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A missing mission, of all modes. Its text is in the metadata, whose path differs by release."""

@@ -74,9 +74,16 @@ def test_check_has_its_group_and_modes() -> None:
     assert report == Report(5, 3, text, "arming_check", "an_event", 0x4000)
     assert report is not None
     assert report.is_check
-    hint = report_of(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)
-    assert hint is not None
-    assert not hint.is_check  # it does not prevent arming
+    info = report_of(6, struct.pack("<IBB", 0x4000, 0, 2), INFO)
+    assert info is not None
+    assert info.is_check  # such as a missing mission
+
+
+@pytest.mark.parametrize(("level", "is_check"), [(3, True), (6, False)])
+def test_ground_stations_link_is_a_check_only_as_an_error(level: int, is_check: bool) -> None:
+    """With NAV_DLL_ACT 0 PX4 reports it for all modes at level info, and arms."""
+    report = Report(5, level, "No connection", "arming_check", "check_rc_dl_no_dllink")
+    assert report.is_check is is_check
 
 
 def test_internal_events_are_not_reported() -> None:
