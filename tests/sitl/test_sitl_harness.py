@@ -139,7 +139,7 @@ def test_a_test_is_skipped_for_an_older_px4_with_the_reason(
 ) -> None:
     sender, _ = senders
     sender.heartbeat(HOLD[PX4])
-    link.until(lambda: link.autopilot == PX4, 5.0, "heard")
+    link.until(lambda: link.autopilot == PX4, 5.0, "received")
     sender.version(0x010E04FF)
     link.read_version()
     assert (link.version, link.name) == ((1, 14), "PX4 1.14")
