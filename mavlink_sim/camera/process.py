@@ -29,6 +29,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.camera.renderer import DEFAULT_CAMERA, DEFAULT_MOUNT
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera, truth_line
@@ -101,10 +102,10 @@ class SharedPoses:
 
 logger = logging.getLogger(__name__)
 
-POSE = struct.Struct("=3d4dqd3dq")
+POSE = struct.Struct("=3d4dqd3dqB")
 """Position NED in metres, quaternion (w, x, y, z) of `ned_from_body`, CLOCK_MONOTONIC nanoseconds, the
 scene's time in seconds, the camera's roll, pitch, yaw on the body (NaN: as mounted), and the
-number of the other aircraft's poses (-1: there are none)."""
+number of the other aircraft's poses (-1: there are none); what is frozen (`CameraFreeze`)."""
 OUTPUT_FAILED = 2
 """Exit code of the process: one of its outputs could not be opened."""
 EARLY_SHARE = 0.3
@@ -188,7 +189,7 @@ def run_camera(
                     time.sleep(wait_s if arrival_s is None else min(wait_s, arrival_s))
                 if poses.poll(0.0):
                     continue
-            *values, stamp_ns, time_s, roll, pitch, yaw, number = POSE.unpack(latest)
+            *values, stamp_ns, time_s, roll, pitch, yaw, number, frozen = POSE.unpack(latest)
             others: tuple[Aircraft, ...] | None = ()
             if shared_poses is not None and number >= 0:
                 others = shared_poses.read(number)
@@ -199,7 +200,10 @@ def run_camera(
             if not math.isnan(roll):
                 turned = replace(mount, roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
             attitude = matrix_from_quaternion((values[3], values[4], values[5], values[6]))
-            frame = camera.capture(values[:3], attitude, int(stamp_ns), time_s, turned, others=others)
+            freeze = CameraFreeze(frozen)
+            frame = camera.capture(
+                values[:3], attitude, int(stamp_ns), time_s, turned, others=others, freeze=freeze
+            )
             if frame is not None:
                 on_the_way.append(frame)
 
@@ -322,6 +326,7 @@ class CameraProcess:
         time_s: float | None = None,
         camera_rpy_rad: tuple[float, float, float] | None = None,
         others: Sequence[Aircraft] = (),
+        freeze: CameraFreeze = CameraFreeze.NOTHING,
     ) -> None:
         """Send the vehicle's pose, and those of the other aircraft; never blocks.
 
@@ -331,6 +336,7 @@ class CameraProcess:
             time_s: the scene's time, which moves its objects; by default the stamp in seconds.
             camera_rpy_rad: a gimbal's roll, pitch, yaw from the body; None leaves the camera as mounted.
             others: the other aircraft at the time of the stamp.
+            freeze: what repeats the frame before.
 
         Raises:
             ValueError: there are more others than `most_others`.
@@ -347,6 +353,7 @@ class CameraProcess:
             stamp_ns / 1e9 if time_s is None else time_s,
             *(camera_rpy_rad or (math.nan,) * 3),
             number,
+            freeze,
         )
         try:
             self._sending.send_bytes(pose)

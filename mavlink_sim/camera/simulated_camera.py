@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mavlink_sim.camera.depth_camera import measured_depth
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.camera.lens import CameraMotion
 from mavlink_sim.camera.renderer import Rendered, Renderer
 from mavlink_sim.camera.scene import Scene
@@ -73,6 +75,7 @@ class SimulatedCamera:
         self._identifier_offset = identifier_offset(scene.world)
         self._others_shown = False
         self._sequence = -1
+        self._shown: tuple[NDArray[np.uint8], NDArray[np.float32]] | None = None
         self._last: tuple[int, NDArray[np.float64], NDArray[np.float64]] | None = None
 
     def capture(
@@ -84,6 +87,7 @@ class SimulatedCamera:
         mount: CameraMount | None = None,
         motion: CameraMotion | None = None,
         others: Sequence[Aircraft] = (),
+        freeze: CameraFreeze = CameraFreeze.NOTHING,
     ) -> Captured | None:
         """The frame at a pose, or None if it is lost.
 
@@ -95,6 +99,7 @@ class SimulatedCamera:
             mount: the current one of a camera on a gimbal.
             motion: of the camera; by default that between the last call's pose and this one's.
             others: the other aircraft at that time; the own one is not visible.
+            freeze: what repeats the frame before.
         """
         settings = self.settings
         time_s = stamp_ns / 1e9 if time_s is None else time_s
@@ -116,6 +121,13 @@ class SimulatedCamera:
         if settings.depth is not None:
             depth = measured_depth(depth, settings.model.fx, settings.depth, self._noise)
         image = np.ascontiguousarray(rendered.image)
+        if self._shown is not None:
+            image = self._shown[0] if CameraFreeze.IMAGE in freeze else image
+            depth = self._shown[1] if CameraFreeze.DEPTH in freeze else depth
+        self._shown = image, depth
+        if CameraFreeze.CLOCK in freeze:
+            image = image.copy()
+            cv2.putText(image, f"{stamp_ns / 1e9:.3f}", (4, 12), cv2.FONT_HERSHEY_PLAIN, 0.8, (255,) * 3)
         frame = Frame(image, stamp_ns, self._sequence, depth)
         return Captured(frame, rendered, time_s, stamp_ns + round(settings.latency_s * 1e9))
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from mavlink_sim.autopilot.commander import Autopilot
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.grammar import Fault
 from mavlink_sim.physics.airframe import Multirotor, Vector
 from mavlink_sim.physics.estimate_errors import FallibleEstimate
@@ -58,6 +59,7 @@ class FaultState(Protocol):
     boot_offset_us: int
     second: dict[int, FaultTarget]
     winds: dict[int, Vector]
+    frozen_camera: dict[int, CameraFreeze]
     pace: float
 
     @property

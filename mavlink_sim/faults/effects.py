@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any
 
 from mavlink_sim.autopilot.commander import TEMPORARILY_REJECTED
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.flight.tasks import Trajectory
@@ -481,6 +482,24 @@ def _blowing(speed_mps: float, from_rad: float) -> Vector:
 def _calm(vehicle: FaultTarget, one: ActiveFault) -> None:
     vehicle.faults.winds.pop(one.number, None)
     vehicle.reload_wind(vehicle.faults.winds.values())
+
+
+# ---- camera
+
+_FROZEN = {
+    "all": CameraFreeze.IMAGE | CameraFreeze.DEPTH,
+    "image": CameraFreeze.IMAGE,
+    "depth": CameraFreeze.DEPTH,
+}
+
+
+def camera_freeze(vehicle: FaultTarget, one: ActiveFault) -> None:
+    """The camera's last images are repeated, with the stamps of the new ones."""
+    frozen = _FROZEN[one.fault.values["what"]]
+    if one.fault.values["clock"] == "yes":
+        frozen |= CameraFreeze.CLOCK
+    vehicle.faults.frozen_camera[one.number] = frozen
+    one.undo.append(partial(vehicle.faults.frozen_camera.pop, one.number))
 
 
 # ---- command

@@ -151,6 +151,14 @@ _TABLE: tuple[Kind, ...] = (
         ),
     ),
     Kind(
+        "camera_freeze",
+        "the camera repeats its last image with new stamps",
+        (
+            Field("what", choice("all", "image", "depth"), "all", "image, depth, or all"),
+            Field("clock", choice("no", "yes"), "no", "yes: a clock in the image goes on"),
+        ),
+    ),
+    Kind(
         "pilot_takeover",
         "a pilot with a remote control switches the mode",
         (Field("mode", choice(*(mode.name for mode in Mode)), "POSCTL", "a mode's name"),),

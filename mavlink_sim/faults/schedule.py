@@ -17,8 +17,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any
 
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.context import ActiveFault, CommandCheck, FaultTarget, Gate
 from mavlink_sim.faults.effects import chosen_links, shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
@@ -49,6 +52,7 @@ class Faults:
         known: active and scheduled faults, by number; without any, `step` need not be called if `elapsed_us`
             is advanced.
         second: other autopilots on the same links; by fault number.
+        frozen_camera: the frozen parts of the vehicle's camera; by fault number.
         winds: added to the wind, NED m/s; by fault number.
         pace: simulated seconds of the vehicle per second of the faults' clock; 0 while it is frozen.
     """
@@ -62,6 +66,7 @@ class Faults:
         self.boot_offset_us = 0
         self.second: dict[int, FaultTarget] = {}
         self.winds: dict[int, Vector] = {}
+        self.frozen_camera: dict[int, CameraFreeze] = {}
         self.pace = 1.0
         self._seed = seed
         self.elapsed_us = 0
@@ -78,6 +83,11 @@ class Faults:
     def now_s(self) -> float:
         """Simulated seconds since the vehicle was created."""
         return self.elapsed_us / 1e6
+
+    @property
+    def camera_freeze(self) -> CameraFreeze:
+        """The frozen parts of the camera."""
+        return reduce(or_, self.frozen_camera.values(), CameraFreeze.NOTHING)
 
     @property
     def active(self) -> list[ActiveFault]:

@@ -123,6 +123,7 @@ class SimOutputs:
                 simulated_s,
                 camera_turn_rad(vehicle),
                 self._fleet_world.others(vehicle),
+                vehicle.faults.camera_freeze,
             )
             if simulated_s >= self._next_camera_check_s:
                 self._next_camera_check_s = simulated_s + CAMERA_CHECK_S

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.camera.process import CameraProcess
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.world import Ground, World, WorldObject
@@ -185,3 +186,19 @@ def _runs(pid: int) -> bool:
 def test_invalid_rate_refused() -> None:
     with pytest.raises(ValueError, match=r"camera's rate .*got 0\.0 Hz"):
         CameraProcess(WORLD, rate_hz=0.0)
+
+
+def test_frozen_process_repeats_its_last_frame(camera: CameraProcess) -> None:
+    before = first_frame(camera, (1.0, 0.0, -2.0), 0.0)
+    stamp_ns = time.monotonic_ns()
+    freeze = CameraFreeze.IMAGE | CameraFreeze.DEPTH
+    camera.send_pose((5.0, 0.0, -2.0), (1.0, 0.0, 0.0, 0.0), stamp_ns, freeze=freeze)
+    assert camera.shared_name is not None
+    with SharedFrameReader(camera.shared_name) as reader:
+        until(lambda: (frame := reader.latest()) is not None and frame.captured_ns == stamp_ns, "the frame")
+        after = reader.latest()
+    assert after is not None
+    assert np.array_equal(before.image, after.image)
+    assert before.depth_m is not None
+    assert after.depth_m is not None
+    assert np.array_equal(before.depth_m, after.depth_m, equal_nan=True)

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SIH_FRAME, SimHarness, position_setpoint, velocity_setpoint
 
@@ -457,3 +458,16 @@ def test_landing_continues_without_gps(harness: SimHarness) -> None:
     assert type(harness.vehicle.autopilot.task).__name__ == "Descend"
     assert harness.mode == "LAND"
     harness.until(lambda: not harness.armed, 25.0)
+
+
+# ---- camera
+
+
+def test_camera_freezes_add_up_and_end(harness: SimHarness) -> None:
+    faults = harness.vehicle.faults
+    depth, image = begin(harness, "camera_freeze depth"), begin(harness, "camera_freeze image clock=yes")
+    assert faults.camera_freeze == CameraFreeze.IMAGE | CameraFreeze.DEPTH | CameraFreeze.CLOCK
+    faults.end(image)
+    assert CameraFreeze.IMAGE not in faults.camera_freeze
+    faults.end(depth)
+    assert not faults.camera_freeze

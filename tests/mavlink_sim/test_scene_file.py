@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.camera.depth_camera import DepthSensor
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.camera.lens import Shutter
 from mavlink_sim.camera.scene import CameraSettings, Path, Scene
 from mavlink_sim.camera.scene_file import SceneError, example_scenes, load_scene, parse_scene, scene_or_demo
@@ -368,3 +369,41 @@ def test_motion_is_difference_of_poses() -> None:
 def test_invalid_camera_refused(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         CameraSettings(**changes)
+
+
+# ---- a camera that repeats its last image
+
+
+@pytest.mark.parametrize(
+    ("freeze", "image", "depth"),
+    [
+        (CameraFreeze.NOTHING, False, False),
+        (CameraFreeze.IMAGE, True, False),
+        (CameraFreeze.DEPTH, False, True),
+        (CameraFreeze.IMAGE | CameraFreeze.DEPTH, True, True),
+    ],
+)
+def test_frozen_parts_repeat_with_new_stamps(freeze: CameraFreeze, image: bool, depth: bool) -> None:
+    camera = SimulatedCamera(SCENE)
+    before = camera.capture((0.0, 0.0, -1.5), LEVEL, 1)
+    after = camera.capture((2.0, 0.0, -1.5), LEVEL, 2, freeze=freeze)
+    thawed = camera.capture((2.0, 0.0, -1.5), LEVEL, 3)
+    assert before is not None
+    assert after is not None
+    assert thawed is not None
+    assert after.frame.captured_ns == 2
+    assert np.array_equal(before.frame.image, after.frame.image) is image
+    assert before.frame.depth_m is not None
+    assert after.frame.depth_m is not None
+    assert np.array_equal(before.frame.depth_m, after.frame.depth_m, equal_nan=True) is depth
+    assert not np.array_equal(before.frame.image, thawed.frame.image)
+
+
+def test_a_clock_goes_on_in_a_frozen_image() -> None:
+    camera, freeze = SimulatedCamera(SCENE), CameraFreeze.IMAGE | CameraFreeze.CLOCK
+    camera.capture((0.0, 0.0, -1.5), LEVEL, 0)
+    frames = [camera.capture((2.0, 0.0, -1.5), LEVEL, n * 10**8, freeze=freeze) for n in (1, 2)]
+    first, second = (captured.frame.image for captured in frames if captured is not None)
+    changed = (first != second).any(axis=2)
+    assert changed.any()
+    assert not changed[20:].any()
