@@ -22,6 +22,8 @@ _LOCAL_NED = 1  # MAV_FRAME
 # ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is not a fault: PX4 sets
 # it at rest with a valid position.
 _VELOCITY_HORIZ, _POS_HORIZ, _POS_VERT = 2, 8 | 16, 32 | 64
+# A position or an attitude that is exactly the one before, with these rates of its own, is frozen.
+_MOVING_MPS, _TURNING_RADPS = 1.0, 0.3
 # A position this far from the one predicted by the previous position and the mean velocity is a reset; PX4's
 # estimate in its own simulation deviated by 0.03 m at most. Over a gap, accelerations of up to 10 m/s2 that
 # neither velocity shows are allowed for; over more than a second no reset can be measured.
@@ -94,6 +96,8 @@ def _attitude_quaternion(state: VehicleState, fields: Fields, now_ns: int) -> Ve
     if not 0.5 < norm < 2.0 or rates is None:  # NaN also fails the comparison
         return state
     attitude = (w / norm, x / norm, y / norm, z / norm)
+    if attitude == state.attitude and math.hypot(*rates) > _TURNING_RADPS:
+        return state  # frozen: it ages
     return with_fields(state, attitude_ns=now_ns, attitude=attitude, angular_velocity_frd_radps=rates)
 
 
@@ -104,6 +108,8 @@ def _local_position_ned(state: VehicleState, fields: Fields, now_ns: int) -> Veh
     boot_ms = fields["time_boot_ms"]
     dt_s = (boot_ms - state.position_boot_ms) * 1e-3
     position_ned_m = _subtract(position, state.reset_offset_ned_m)
+    if position_ned_m == state.position_ned_m and math.hypot(*velocity) > _MOVING_MPS:
+        return state  # frozen: it ages
     if state.position_ned_m is not None and state.velocity_ned_mps is not None:
         jump = _jump(state.position_ned_m, state.velocity_ned_mps, position_ned_m, velocity, dt_s)
         if jump is not None and math.hypot(*jump) > _JUMP_M + _JUMP_MPS2 * dt_s * dt_s:

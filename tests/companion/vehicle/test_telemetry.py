@@ -196,3 +196,23 @@ def test_small_reset_is_detected_by_its_counter() -> None:
 def test_estimator_flags_set_position_valid(flags: int, valid: bool) -> None:
     state = apply_message(VehicleState(), "ESTIMATOR_STATUS", {"flags": flags}, 1)
     assert state.position_valid is valid
+
+
+def test_a_position_that_stands_still_at_speed_ages() -> None:
+    state = apply_message(VehicleState(), "LOCAL_POSITION_NED", at(1_000, 5.0), 10)
+    frozen = apply_message(state, "LOCAL_POSITION_NED", at(1_033, 5.0), 20)
+    assert frozen.position_ns == 10
+    assert apply_message(frozen, "LOCAL_POSITION_NED", at(1_066, 5.2), 30).position_ns == 30
+    resting = apply_message(VehicleState(), "LOCAL_POSITION_NED", at(1_000, 5.0, 0.0), 10)
+    assert apply_message(resting, "LOCAL_POSITION_NED", at(1_033, 5.0, 0.0), 20).position_ns == 20
+
+
+def test_an_attitude_that_stands_still_while_turning_ages() -> None:
+    def turned(yaw_rad: float, rate_radps: float) -> dict[str, float]:
+        rates = {"rollspeed": 0.0, "pitchspeed": 0.0, "yawspeed": rate_radps}
+        return {"q1": math.cos(yaw_rad / 2), "q2": 0.0, "q3": 0.0, "q4": math.sin(yaw_rad / 2)} | rates
+
+    state = apply_message(VehicleState(), "ATTITUDE_QUATERNION", turned(0.3, 1.0), 10)
+    assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.3, 1.0), 20).attitude_ns == 10
+    assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.3, 0.0), 20).attitude_ns == 20
+    assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.31, 1.0), 20).attitude_ns == 20
