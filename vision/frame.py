@@ -23,6 +23,8 @@ class Frame:
         decode_ms: decoding time, milliseconds.
         media_s: position in the recording, seconds; None for a live source.
         file_name: of the image or video, without folder; empty if the frame is not from a file.
+        image_since_ns: capture of the first of the identical colour images that end with this one; None: not
+            compared (`FrameChanges`). depth_since_ns: the same of the depth images.
 
     >>> import time
     >>> import numpy as np
@@ -40,6 +42,8 @@ class Frame:
     decode_ms: float = 0.0
     media_s: float | None = None
     file_name: str = ""
+    image_since_ns: int | None = None
+    depth_since_ns: int | None = None
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:

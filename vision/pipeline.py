@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vision.depth import DepthSummary, depth_summary
 from vision.detections import Detections
 from vision.frame import Frame
+from vision.frame_changes import FrameChanges
 from vision.frame_selection import TOO_OLD, FrameSelector, Selection
 from vision.marker_boards import BoardPose
 from vision.markers import Marker
@@ -51,6 +52,8 @@ class PerceptionResult:
         obstacles: distance of the nearest one in each direction; None without depth or attitude.
         boards: those of the markers that belong to a board.
         depth: of the frame's depth image; None without one.
+        image_since_ns, depth_since_ns: as of `Frame`.
+        frames_repeated: frames so far with the colour image (`image`), or the `depth`, of the frame before.
 
     >>> from vision import Detections, PerceptionResult
     >>> result = PerceptionResult(
@@ -74,6 +77,15 @@ class PerceptionResult:
     obstacles: ObstacleSectors | None = None
     boards: tuple[BoardPose, ...] = ()
     depth: DepthSummary | None = None
+    image_since_ns: int | None = None
+    depth_since_ns: int | None = None
+    frames_repeated: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def since_ns(self) -> int:
+        """Capture of the oldest of the identical images that this result was made of."""
+        stamps = (self.captured_ns, self.image_since_ns, self.depth_since_ns)
+        return min(stamp for stamp in stamps if stamp is not None)
 
 
 class FrameDetector(Protocol):
@@ -145,6 +157,7 @@ class Pipeline:
         self._source = source
         self._detector = detector
         self._selector = FrameSelector(selection)
+        self._changes = FrameChanges()
         self._recorder = recorder
         self._tracker = tracker if detector is not None else None
         self.object_selection: ObjectSelection | None = None
@@ -171,6 +184,11 @@ class Pipeline:
         return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.frames_skipped}
 
     @property
+    def frames_repeated(self) -> dict[str, int]:
+        """Kind of image → frames so far that repeated it; see `PerceptionResult`."""
+        return self._changes.repeated
+
+    @property
     def dropped(self) -> int:
         """Frames lost so far between the source and here; frames skipped on purpose do not count."""
         return self._missing + self._selector.frames_skipped[TOO_OLD]
@@ -188,6 +206,7 @@ class Pipeline:
         if frame is None:
             return False
         picked_ns = self._clock_ns()
+        frame = self._changes.stamped(frame)
         self._missing += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
         self.frames += 1
@@ -263,4 +282,7 @@ class Pipeline:
             obstacles=obstacles,
             boards=boards,
             depth=depth,
+            image_since_ns=frame.image_since_ns,
+            depth_since_ns=frame.depth_since_ns,
+            frames_repeated=self.frames_repeated,
         )

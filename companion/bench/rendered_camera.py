@@ -56,7 +56,13 @@ class RenderedCamera:
         """As `WorkerCamera.send_state` sends it to the worker."""
         if state.attitude is not None:
             position = None if state.position_ned_m is None else (state.position_ns, state.position_ned_m)
-            self.perception.add_attitude(state.attitude_ns, state.attitude, state.height_m, position)
+            self.perception.add_attitude(
+                state.attitude_ns,
+                state.attitude,
+                state.height_m,
+                position,
+                in_flight=self.perceived.in_flight,
+            )
         gimbal = state.gimbal
         if gimbal is not None and gimbal.attitude is not None and self.perceived.settings.camera.on_gimbal:
             with contextlib.suppress(HistoryError):

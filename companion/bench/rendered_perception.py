@@ -100,13 +100,17 @@ class RenderedPerception:
         wxyz: Quaternion,
         height_m: float | None,
         position: tuple[int, Vector3] | None = None,
+        *,
+        in_flight: bool = False,
     ) -> None:
         """Receive the vehicle's attitude, as the service sends it to the worker.
 
         Args:
             wxyz: `ned_from_body`. height_m: above home; None: not known.
             position: its own stamp, and local NED metres.
+            in_flight: whether it flies.
         """
+        self._telemetry.in_flight = in_flight
         self._telemetry.attitudes.add(stamp_ns, wxyz)
         self._telemetry.height_m = height_m
         if position is not None:
@@ -141,7 +145,13 @@ class RenderedPerception:
         attitude = matrix_from_quaternion(vehicle.quaternion)
         time_s = vehicle.faults.now_s if time_s is None else time_s
         return self._camera.capture(
-            position_in_world(vehicle), attitude, now_ns, time_s, mount, others=others
+            position_in_world(vehicle),
+            attitude,
+            now_ns,
+            time_s,
+            mount,
+            others=others,
+            freeze=vehicle.faults.camera_freeze,
         )
 
     def process(self, frame: Frame, now_ns: int) -> PerceptionResult | None:

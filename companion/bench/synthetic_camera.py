@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
 from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState
+from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.lockstep import Truth
 from vision.attitude import Quaternion
 from vision.detections import Detections
@@ -25,6 +28,8 @@ Detect = Callable[[Vector3, Quaternion, float], Detections]
 
 class SyntheticCamera:
     """See `lockstep_flight.Camera`.
+
+    The fault `camera_freeze` repeats the detections of the last frame, as they are made of its image.
 
     Args:
         settings: the camera's model and mount, and all else that places what it sees.
@@ -51,6 +56,8 @@ class SyntheticCamera:
         self._tracker = None if tracker is None or detect is None else Tracker(tracker)
         self._attitudes = AttitudeHistory()
         self._sequence = -1
+        self._shown: tuple[Detections, tuple[Marker, ...] | None] | None = None
+        self._image_ns = self._depth_ns = 0
 
     def on_state(self, state: VehicleState, history: StateHistory) -> None:
         if state.attitude is not None:
@@ -58,16 +65,22 @@ class SyntheticCamera:
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
         captured_ns, seconds, truth = flight.now_ns, flight.seconds, flight.vehicle.truth
+        freeze = flight.vehicle.vehicle.faults.camera_freeze
         self._sequence += 1
         sequence = self._sequence
-        detections = Detections.empty(())
-        if self._detect is not None:
-            detections = self._detect(truth.position_ned_m, truth.quaternion, seconds)
-        markers = None
-        if self._find_markers is not None:
-            markers = self._find_markers(truth, seconds)
-            if markers is None:
+        if CameraFreeze.IMAGE not in freeze or self._shown is None:
+            detections = Detections.empty(())
+            if self._detect is not None:
+                detections = self._detect(truth.position_ned_m, truth.quaternion, seconds)
+            markers = None if self._find_markers is None else self._find_markers(truth, seconds)
+            if self._find_markers is not None and markers is None:
                 return lambda: None
+            self._shown, self._image_ns = (detections, markers), captured_ns
+        if CameraFreeze.DEPTH not in freeze:
+            self._depth_ns = captured_ns
+        detections, markers = self._shown
+        image_ns = captured_ns if CameraFreeze.CLOCK in freeze else self._image_ns
+        depth_ns = self._depth_ns if np.isfinite(detections.depth_m).any() else None
         width, height = self._size
 
         def finish() -> PerceptionResult:
@@ -87,6 +100,8 @@ class SyntheticCamera:
                 0,
                 track_events=events,
                 markers=markers,
+                image_since_ns=image_ns,
+                depth_since_ns=depth_ns,
             )
 
         return finish

@@ -147,6 +147,7 @@ def _camera(supervisor: PerceptionSupervisor) -> StatusCameraBody:
         "timing_p99_ms": _rounded(status.timing_p99_ms),
         "dropped": status.dropped,
         "frames_skipped": dict(status.frames_skipped),
+        "frames_repeated": dict(status.frames_repeated),
         "stuck_after_s": status.stuck_after_s,
         "class_names": list(status.class_names),
         "tracks": status.tracks,

@@ -9,6 +9,7 @@ from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks, Wanted
+from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
@@ -111,6 +112,7 @@ class BehaviourContext:
         goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
         tracks: of the steering camera, those that have ended included.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
+        camera_fault: why nothing that the steering camera shows is used; empty: it is.
 
     >>> from companion import BehaviourContext
     >>> from companion.vehicle.state import VehicleState
@@ -138,6 +140,7 @@ class BehaviourContext:
     planned: PlannedPath | None = None
     avoiding: bool = False
     velocities: tuple[VelocityInput, ...] = ()
+    camera_fault: str = ""
 
     def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""
@@ -150,9 +153,9 @@ class BehaviourContext:
         return self.perception_fresh if wanted.marker_id is None else self.steering_markers.fresh
 
     def perception_fault(self, default: str) -> str:
-        """Why targets cannot be used, in words; `default` where the gimbal is not the reason."""
+        """Why targets cannot be used, in words; `default` where neither gimbal nor camera is the reason."""
         why = self.gimbal.direction_fault
-        return f"camera direction unknown ({why})" if why else default
+        return f"camera direction unknown ({why})" if why else self.camera_fault or default
 
     @property
     def neighbours(self) -> tuple[Neighbour, ...]:
@@ -296,6 +299,11 @@ class Behaviour(ABC):
     def active(self) -> Behaviour:
         """The behaviour that is active now: itself, or the current one of a sequence."""
         return self
+
+    @property
+    def approached(self) -> Approached | None:
+        """The object that it flies to now; None: none. Its distance must fall as the vehicle flies there."""
+        return None
 
     @property
     def landing_target(self) -> LandingTarget | None:

@@ -20,6 +20,7 @@ from companion.guidance.interface import Answer, CommandInput, EventKind, Guidan
 from companion.guidance.limits.battery import ENDINGS, BatteryMinimum, BatteryMonitor
 from companion.guidance.mode_control import ModeControl, Phase
 from companion.guidance.setpoint_output import SetpointOutput
+from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from companion.vehicle.streamer import StreamState
@@ -44,6 +45,7 @@ class BehaviourRunner:
         behaviour: the active behaviour, including the hold between commands; None: none.
         active: the same, inside a sequence its current one; None: none has been updated yet.
         busy: a commanded behaviour has not ended yet.
+        approached: the object that it flies to; None: none.
         gimbal_user: name of the behaviour that moves the gimbal; empty: none.
         goal_ned_m: where the behaviour before wanted the vehicle; None: unknown.
         failure: exception of the step before, in words; empty: none.
@@ -64,6 +66,7 @@ class BehaviourRunner:
         # Read once in each step, where an exception is handled.
         self.active: Behaviour | None = None
         self.gimbal_user = ""
+        self.approached: Approached | None = None
         self._landing = False
         self._setpoints = setpoints
         self._modes = modes
@@ -157,7 +160,7 @@ class BehaviourRunner:
         """Remove the active behaviour and answer its command."""
         behaviour, command, busy = self.behaviour, self._command, self.busy
         after_battery, self._after_battery = self._after_battery, False
-        self.behaviour = self._command = self.active = None
+        self.behaviour = self._command = self.active = self.approached = None
         self.busy, self._landing, self.gimbal_user = False, False, ""
         if behaviour is None:
             return
@@ -179,6 +182,7 @@ class BehaviourRunner:
         self._activated, self._position_lost_ns = False, None
         self._setpoints.begin()
         self.active, self._landing, self.gimbal_user = None, False, ""
+        self.approached = None
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
@@ -200,7 +204,7 @@ class BehaviourRunner:
             offboard = self._modes.phase is Phase.OFFBOARD
             step = self._setpoints.steer(step, context, behaviour.name, offboard=offboard)
         self.active = active = behaviour.active
-        self._landing = active.landing
+        self._landing, self.approached = active.landing, active.approached
         self.gimbal_user = active.name if active.gimbal_aim is not None else ""
         match step:
             case Outcome():

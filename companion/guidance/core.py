@@ -36,9 +36,12 @@ from companion.guidance.mode_control import ModeControl, Phase
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.guidance.targets.chosen import RecentTracks
+from companion.guidance.targets.closing_check import ClosingCheck
+from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
+from companion.vehicle.state import VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.occupancy_grid import Point
 
@@ -88,6 +91,7 @@ class Guidance:
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
+        self._closing = ClosingCheck()
         self._context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
@@ -254,7 +258,7 @@ class Guidance:
         )
         targets = inputs.targets if fresh else ()
         self._tracks = self._tracks.updated(targets)
-        return BehaviourContext(
+        context = BehaviourContext(
             now_ns,
             inputs.state,
             targets,
@@ -274,7 +278,22 @@ class Guidance:
             planned=inputs.planned,
             avoiding=self.options.avoid,
             velocities=inputs.velocities,
+            camera_fault=inputs.camera_fault,
         )
+        fault = self._check_closing(inputs.state, targets)
+        return context if not fault else _blinded(context, fault)
+
+    def _check_closing(self, state: VehicleState, targets: tuple[Target, ...]) -> str:
+        """What is wrong with the distance to the object that is flown to, in words; empty: nothing."""
+        if not self._runner.busy:
+            self._closing.reset()
+        known, position = self._closing.fault, state.position_ned_m
+        if known or position is None:
+            return known
+        fault = self._closing.update(self._runner.approached, targets, state.position_ns, position)
+        if fault and (behaviour := self._runner.behaviour) is not None:
+            self._out.event(EventKind.NOTED, behaviour.name, fault, warning=True)
+        return fault
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:
         out = self._out
@@ -308,6 +327,7 @@ class Guidance:
             self._out.result(command.identifier, outcome)
             self._out.event(EventKind.REFUSED, behaviour.name, f"refused: {missing}", outcome)
             return
+        self._closing.reset()
         self._runner.begin_command(behaviour, command, context)
         if isinstance(behaviour, StopBehaviour):
             self.gimbal.end_goal(behaviour.name, self._out)
@@ -332,3 +352,17 @@ class Guidance:
         late = context.now_ns >= due_ns
         self._obstacle_distance_ns = context.now_ns + OBSTACLE_DISTANCE_PERIOD_NS if late else due_ns
         return context.obstacles
+
+
+def _blinded(context: BehaviourContext, fault: str) -> BehaviourContext:
+    """The context without anything that cameras show: behaviours brake, and end with the fault."""
+    markers = replace(context.markers, targets=(), fresh=False, fault=fault)
+    steering = replace(context.steering_markers, targets=(), fresh=False, fault=fault)
+    return replace(
+        context,
+        targets=(),
+        perception_fresh=False,
+        markers=markers,
+        steering_markers=steering,
+        camera_fault=fault,
+    )

@@ -197,6 +197,7 @@ class GuidanceInput:
         answers: to requests of earlier steps. commands: the new ones, oldest first.
         ending: the service ends: no command begins, and control is released.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
+        camera_fault: why nothing that the steering camera shows is used, in words; empty: it is.
         altitude_acceptance_m: how far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known.
         standstill: of the computer or the process, since the previous step; None: none.
     """
@@ -220,6 +221,7 @@ class GuidanceInput:
     velocities: tuple[VelocityInput, ...] = ()
     altitude_acceptance_m: float | None = None
     standstill: Standstill | None = None
+    camera_fault: str = ""
 
 
 @dataclass(frozen=True, slots=True)

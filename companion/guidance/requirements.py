@@ -131,4 +131,4 @@ def _perceiving(context: BehaviourContext) -> bool:
 def _perception_age(context: BehaviourContext) -> str:
     if context.perception_age_s is None:
         return "no detections received yet"
-    return f"newest frame {context.perception_age_s:.1f} s old"
+    return context.camera_fault or f"newest frame {context.perception_age_s:.1f} s old"

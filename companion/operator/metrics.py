@@ -177,6 +177,9 @@ def _of_cameras(cameras: dict[str, Status]) -> Iterator[GaugeMetricFamily | Coun
     frames_skipped = CounterMetricFamily(
         "companion_frames_skipped", "frames without a published result", labels=["camera", "reason"]
     )
+    frames_repeated = CounterMetricFamily(
+        "companion_frames_repeated", "frames identical to the one before", labels=["camera", "kind"]
+    )
     stages = GaugeMetricFamily(
         "companion_stage_milliseconds",
         "duration of one stage, newest 200 results",
@@ -190,6 +193,8 @@ def _of_cameras(cameras: dict[str, Status]) -> Iterator[GaugeMetricFamily | Coun
     for camera, state in cameras.items():
         for reason, count in state["frames_skipped"].items():
             frames_skipped.add_metric([camera, reason], float(count))
+        for kind, count in state["frames_repeated"].items():
+            frames_repeated.add_metric([camera, kind], float(count))
         for quantile, key in (("0.5", "timing_p50_ms"), ("0.99", "timing_p99_ms")):
             for stage, value in state[key].items():
                 stages.add_metric([camera, stage, quantile], float(value))
@@ -197,4 +202,4 @@ def _of_cameras(cameras: dict[str, Status]) -> Iterator[GaugeMetricFamily | Coun
             age.add_metric([camera], float(state["age_s"]))
         rate.add_metric([camera], float(state["rate_hz"]))
         running.add_metric([camera], float(state["state"] == "running"))
-    yield from (frames_skipped, stages, age, rate, running)
+    yield from (frames_skipped, frames_repeated, stages, age, rate, running)

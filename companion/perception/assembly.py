@@ -36,12 +36,14 @@ class CameraTelemetry:
         attitudes: of the vehicle, the last `ATTITUDES_S`. height_m: the newest above home; None: unknown.
         gimbal: attitudes of the camera's gimbal; empty for a fixed camera.
         positions: of the vehicle, the last few seconds.
+        in_flight: whether the vehicle flies.
     """
 
     def __init__(self) -> None:
         self.attitudes, self.gimbal = AttitudeHistory(ATTITUDES_S), AttitudeHistory(ATTITUDES_S)
         self.positions = PositionHistory()
         self.height_m: float | None = None
+        self.in_flight = False
 
 
 def build_pipeline(
@@ -93,7 +95,9 @@ def build_path_planning(settings: Settings, telemetry: CameraTelemetry) -> PathP
     if not settings.guidance.avoid:
         return None
     pose_at, model = _pose_at(settings, telemetry), settings.camera.model
-    return PathPlanning(telemetry.positions, pose_at, model, lambda: telemetry.height_m)
+    return PathPlanning(
+        telemetry.positions, pose_at, model, lambda: telemetry.height_m, lambda: telemetry.in_flight
+    )
 
 
 def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector | None:

@@ -31,6 +31,7 @@ from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
 from vision.camera_model import CameraCalibration
+from vision.obstacle_sectors import ObstacleSectors
 from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected, SelectRequest
@@ -59,8 +60,12 @@ class PerceptionCamera:
     Attributes:
         name: None for the first.
         settings: with this camera's own sections; `camera` includes the camera's own calibration.
-        newest: the newest result; None before the first.
-        targets: the newest result's localized objects, after `localize`.
+        in_flight: set by the owner. Then a result with an image seen before is no new one (`repeats`); on
+            the ground a camera may well see nothing change.
+        newest: the newest result; None before the first. repeats: it shows nothing new, or is outdated.
+        seen_ns: capture of the newest result that showed something new; None before the first.
+        obstacles: of the newest new depth image; None before the first.
+        targets: that result's localized objects, after `localize`.
         localization_error: why they could not be localized; empty if they were.
         fused: the positions of its confirmed tracks, after `localize`.
         class_names: classes of the detector; None before it is loaded.
@@ -73,7 +78,10 @@ class PerceptionCamera:
     ) -> None:
         self.name = name
         self.settings = settings
+        self.in_flight = self.repeats = False
         self.newest: PerceptionResult | None = None
+        self.seen_ns: int | None = None
+        self.obstacles: ObstacleSectors | None = None
         self.targets: tuple[Target, ...] = ()
         self.localization_error = ""
         self.fused = FusedTracks()
@@ -81,6 +89,8 @@ class PerceptionCamera:
         self.path_request: PathRequest | None = None
         self._class_names = class_names
         self._has_depth = False
+        self._repeated = ""
+        self._valid_from_ns = 0
         self._between_s: deque[float] = deque(maxlen=9)
 
     @property
@@ -88,8 +98,15 @@ class PerceptionCamera:
         return self._class_names
 
     def age_s(self, now_ns: int) -> float | None:
-        """Age of the newest result since its capture; None before the first."""
-        return None if self.newest is None else (now_ns - self.newest.captured_ns) / 1e9
+        """Age of the newest result that showed something new, since its capture; None before the first."""
+        return None if self.seen_ns is None else (now_ns - self.seen_ns) / 1e9
+
+    def frozen(self, now_ns: int) -> str:
+        """Why the camera counts as frozen, in words; empty: it does not."""
+        age_s = self.age_s(now_ns)
+        if not self.repeats or age_s is None or age_s <= self.settings.guidance.perception_max_age_s:
+            return ""
+        return f"camera frozen: the same {self._repeated} for {age_s:.1f} s"
 
     def seeing(self, now_ns: int) -> bool:
         """Whether results arrive as expected, or none are expected."""
@@ -114,9 +131,10 @@ class PerceptionCamera:
         heights = frozenset(self.settings.detector.heights())
         return RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
 
-    def discard_received(self) -> None:
-        """What was received is outdated."""
-        self.newest = self.planned = None
+    def discard_received(self, now_ns: int) -> None:
+        """What was received is outdated, and so is a result of an image from before, when it arrives."""
+        self._valid_from_ns = now_ns
+        self.newest = self.planned = self.seen_ns = self.obstacles = None
         self.targets, self.fused = (), FusedTracks()
 
     def localize(self, result: PerceptionResult, history: StateHistory) -> None:
@@ -151,8 +169,23 @@ class PerceptionCamera:
         if self.newest is not None:
             self._between_s.append(max(result.captured_ns - self.newest.captured_ns, 0) / 1e9)
         self.newest = result
+        # Frames may be left out between two results: what counts is a change since the last one.
+        self._repeated = "image" if _seen(result.image_since_ns, self.seen_ns) else "depth image"
+        outdated = result.captured_ns < self._valid_from_ns
+        self.repeats = outdated or (self.in_flight and _seen(result.since_ns, self.seen_ns))
+        if not self.repeats:
+            self.seen_ns = result.captured_ns
+        if (obstacles := result.obstacles) is not None and not outdated:
+            known_ns = None if self.obstacles is None else self.obstacles.captured_ns
+            if not (self.in_flight and _seen(result.depth_since_ns, known_ns)):
+                self.obstacles = obstacles
         if result.obstacles is not None or bool(np.isfinite(result.detections.depth_m).any()):
             self._has_depth = True
+
+
+def _seen(since_ns: int | None, seen_ns: int | None) -> bool:
+    """Whether an image is that of an earlier result."""
+    return since_ns is not None and seen_ns is not None and since_ns <= seen_ns
 
 
 class WorkerCamera(PerceptionCamera):
@@ -222,7 +255,9 @@ class WorkerCamera(PerceptionCamera):
         """Send the attitudes of vehicle and gimbal to the worker, for its tracker."""
         if state.attitude is not None:
             position = None if state.position_ned_m is None else (state.position_ns, state.position_ned_m)
-            self.supervisor.send_attitude(state.attitude_ns, state.attitude, state.height_m, position)
+            self.supervisor.send_attitude(
+                state.attitude_ns, state.attitude, state.height_m, position, in_flight=self.in_flight
+            )
         gimbal = state.gimbal
         if gimbal is None or not self.settings.camera.on_gimbal or gimbal.attitude is None:
             return

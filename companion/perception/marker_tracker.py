@@ -223,7 +223,8 @@ class MarkerTracker:
             return MarkerSight(missing="")
         age_s = (now_ns - seen.captured_ns) / 1e9
         fresh = age_s <= max_age_s
-        return MarkerSight(seen.targets if fresh else (), seen.captured_ns, age_s, fresh, "")
+        targets = seen.targets if fresh else ()
+        return MarkerSight(targets, seen.captured_ns, age_s, fresh, "", camera.frozen(now_ns))
 
     def sight(self, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the cameras that look down, for behaviours."""
@@ -238,7 +239,8 @@ class MarkerTracker:
         age_s = (now_ns - newest_ns) / 1e9
         fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
         targets = tuple(target for seen in fresh for target in seen.targets)
-        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "")
+        frozen = [why for camera in self._detecting if (why := camera.frozen(now_ns))]
+        return MarkerSight(targets, newest_ns, age_s, bool(fresh), "", "; ".join(frozen))
 
     def _no_camera_below(self) -> str:
         cameras = ", ".join(

@@ -64,12 +64,14 @@ class Attitude:
         stamp_ns: of the attitude, CLOCK_MONOTONIC. wxyz: (w, x, y, z), body FRD to NED.
         height_m: above home.
         position: its own stamp, and local NED metres.
+        in_flight: whether it flies.
     """
 
     stamp_ns: int
     wxyz: Quaternion
     height_m: float | None = None
     position: tuple[int, Vector3] | None = None
+    in_flight: bool = False
 
 
 @dataclass(frozen=True, slots=True)

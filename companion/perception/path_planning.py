@@ -65,6 +65,7 @@ class PathPlanning:
         pose_at: from a capture stamp to the camera's mount and (3, 3) `ned_from_body`; None: unknown.
         camera_of: the camera's model for an image size.
         height_m: the vehicle's height above home; None: unknown.
+        in_flight: whether the vehicle flies.
 
     Attributes:
         grid: around the vehicle.
@@ -76,10 +77,11 @@ class PathPlanning:
         pose_at: Callable[[int], tuple[CameraMount, Array] | None],
         camera_of: Callable[[int, int], CameraModel],
         height_m: Callable[[], float | None],
+        in_flight: Callable[[], bool] = lambda: False,
     ) -> None:
         self.grid = OccupancyGrid()
         self._positions, self._pose_at = positions, pose_at
-        self._camera_of, self._height_m = camera_of, height_m
+        self._camera_of, self._height_m, self._in_flight = camera_of, height_m, in_flight
         self._request: tuple[PathRequest, int] | None = None
         self._newest: PlannedPath | None = None
         self._due_ns = 0
@@ -89,8 +91,13 @@ class PathPlanning:
         self._request = (request, now_ns)
 
     def update(self, frame: Frame, now_ns: int) -> PlannedPath | None:
-        """Add a frame's depth and plan; None: nothing is requested or due, or depth or pose is missing."""
+        """Add a frame's depth and plan; None: nothing is requested or due, or depth or pose is missing.
+
+        In flight, depth that repeats that of the frame before is none: by this frame's pose it is misplaced.
+        """
         if frame.depth_m is None:
+            return None
+        if frame.depth_since_ns not in (None, frame.captured_ns) and self._in_flight():
             return None
         pose, position = self._pose_at(frame.captured_ns), self._positions.at(frame.captured_ns)
         if pose is None or position is None:

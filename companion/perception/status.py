@@ -41,6 +41,7 @@ class PerceptionStatus:
         dropped: frames lost before they were processed, and results replaced by newer ones before sending.
         frames_skipped: reason → frames that were not processed, or whose result was replaced by a newer one
             before it was sent (`superseded`); see `PerceptionResult`.
+        frames_repeated: kind of image → frames that repeated it; see `PerceptionResult`.
         stuck_after_s: the silence after which the worker is stuck.
         class_names: classes of the model; empty before the start and without a detector.
         tracks: confirmed tracks that have not ended.
@@ -62,6 +63,7 @@ class PerceptionStatus:
     timing_p99_ms: Mapping[str, float] = field(default_factory=dict)
     dropped: int = 0
     frames_skipped: Mapping[str, int] = field(default_factory=dict)
+    frames_repeated: Mapping[str, int] = field(default_factory=dict)
     stuck_after_s: float | None = None
     class_names: tuple[str, ...] = ()
     tracks: int = 0

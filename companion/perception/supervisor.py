@@ -77,11 +77,13 @@ class _Counts:
     frames: int = 0
     dropped: int = 0
     frames_skipped: dict[str, int] = field(default_factory=dict)
+    frames_repeated: dict[str, int] = field(default_factory=dict)
 
     def add(self, other: _Counts) -> None:
         self.frames += other.frames
         self.dropped += other.dropped
         self.frames_skipped = _sum(self.frames_skipped, other.frames_skipped)
+        self.frames_repeated = _sum(self.frames_repeated, other.frames_repeated)
 
 
 class PerceptionSupervisor:
@@ -227,6 +229,8 @@ class PerceptionSupervisor:
         attitude: Quaternion,
         height_m: float | None = None,
         position: tuple[int, Vector3] | None = None,
+        *,
+        in_flight: bool = False,
     ) -> None:
         """Send the vehicle's attitude, for tracker and obstacles; at most 50 a second. Never waits.
 
@@ -235,9 +239,10 @@ class PerceptionSupervisor:
             attitude: (w, x, y, z), body FRD to NED.
             height_m: above home, None if unknown.
             position: its own stamp, and local NED metres.
+            in_flight: whether it flies.
         """
         if self._needs_attitude and self._process is not None and self._vehicle_limiter.due(stamp_ns):
-            self._process.send_attitude(Attitude(stamp_ns, attitude, height_m, position))
+            self._process.send_attitude(Attitude(stamp_ns, attitude, height_m, position, in_flight))
 
     def request_path(self, request: PathRequest) -> None:
         """Send what path to plan; repeat it while it is wanted. Never waits."""
@@ -288,6 +293,7 @@ class PerceptionSupervisor:
             timing_p99_ms=self._times.quantile_ms(0.99),
             dropped=self._before.dropped + self._now.dropped,
             frames_skipped=_sum(self._before.frames_skipped, self._now.frames_skipped),
+            frames_repeated=_sum(self._before.frames_repeated, self._now.frames_repeated),
             stuck_after_s=None if self._watchdog is None else self._watchdog.stuck_after_s,
             class_names=self.class_names,
             runtime=None if self._ready is None else self._ready.runtime,
@@ -493,6 +499,7 @@ class PerceptionSupervisor:
             replace(report.result, sequence=report.result.sequence + self._first_sequence)
         )
         self._count(report.frames, result.dropped, result.frames_skipped, report.replaced)
+        self._now.frames_repeated = dict(result.frames_repeated)
         result = replace(result, dropped=self._before.dropped + self._now.dropped)
         for event in result.track_events:
             if event.kind is TrackEventKind.END and event.track.class_name == TARGET_CLASS:
@@ -506,7 +513,8 @@ class PerceptionSupervisor:
 
     def _count(self, frames: int, dropped: int, frames_skipped: Mapping[str, int], superseded: int) -> None:
         """Set the counts of the current worker."""
-        self._now = _Counts(frames, dropped + superseded, {**frames_skipped, "superseded": superseded})
+        skipped = {**frames_skipped, "superseded": superseded}
+        self._now = _Counts(frames, dropped + superseded, skipped, self._now.frames_repeated)
 
     def _selection_ended(self) -> None:
         """The worker has ended: its selected object is lost, and its pending selections have failed."""

@@ -113,6 +113,7 @@ class ControlChannel:
             elif isinstance(message, Attitude):
                 self.telemetry.attitudes.add(message.stamp_ns, message.wxyz)
                 self.telemetry.height_m = message.height_m
+                self.telemetry.in_flight = message.in_flight
                 if message.position is not None:
                     self.telemetry.positions.add(*message.position)
             elif isinstance(message, GimbalAttitude):

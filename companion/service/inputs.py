@@ -22,6 +22,7 @@ from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.from_detections import StateHistory
 from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import PerceptionCamera
+from companion.perception.freeze_reports import FreezeReports
 from companion.perception.marker_tracker import MarkerTracker
 from companion.plugins import load_plugins
 from companion.recording.guidance_record import StepContext
@@ -29,8 +30,7 @@ from companion.service.velocity_senders import VelocitySenders
 from companion.settings import CameraSection, Settings
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report
-from companion.vehicle.state import FlightMode, VehicleState
-from vision.obstacle_sectors import ObstacleSectors
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected
 
@@ -72,8 +72,6 @@ class InputAssembler:
         self.altitude_acceptance_m: float | None = None
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
-        self._valid_from_ns = 0
-        self._obstacles: ObstacleSectors | None = None
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
         self._on_event = on_event
@@ -81,6 +79,7 @@ class InputAssembler:
         self._logged_ns: dict[str, int] = {}
         self._recorded_section: CameraSection | None = None
         self._section_json = ""
+        self._freezes = FreezeReports(on_event)
 
     def on_state(self, state: VehicleState) -> None:
         """Process a new snapshot of the vehicle."""
@@ -94,6 +93,9 @@ class InputAssembler:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
         self._state = state
+        in_flight = state.armed and state.landed is not LandedState.ON_GROUND
+        for camera in self._cameras.values():
+            camera.in_flight = in_flight
         self.history.add(state)
 
     def _log_reports(self, state: VehicleState) -> None:
@@ -110,16 +112,19 @@ class InputAssembler:
             self._logged_ns.clear()
 
     def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
-        """Process a camera's result; returns its markers if marker detection is on."""
+        """Process a camera's result; returns its markers if marker detection is on.
+
+        In flight an image that was seen before is no new frame: nothing that it shows is used, and what the
+        first of the identical images showed grows old.
+        """
         markers = None
-        if result.captured_ns < self._valid_from_ns:
+        self._freezes.update(camera, result.captured_ns)
+        if camera.repeats:
             return None
         if result.markers is not None:
             markers = self._markers.localize(camera, result, self.history, self._state)
         if camera is self.steering:
             camera.localize(result, self.history)
-            if result.obstacles is not None:
-                self._obstacles = result.obstacles
         return markers
 
     def assemble(
@@ -134,15 +139,13 @@ class InputAssembler:
         standstill: Standstill | None = None,
     ) -> GuidanceInput:
         """Assemble the input of one step."""
-        steering, newest = self.steering, self.steering.newest
-        if newest is not None and newest.captured_ns < self._valid_from_ns:
-            newest = None
+        steering = self.steering
         return GuidanceInput(
             state,
             stream,
-            () if newest is None else steering.targets,
-            None if newest is None else newest.captured_ns,
-            self._obstacles,
+            steering.targets,
+            steering.seen_ns,
+            steering.obstacles,
             steering.planned,
             self._markers.sight(now_ns, self._settings.guidance.perception_max_age_s),
             self.poses.neighbourhood(state, now_ns),
@@ -156,12 +159,13 @@ class InputAssembler:
             self.velocities.newest(now_ns),
             self.altitude_acceptance_m,
             standstill,
+            steering.frozen(now_ns),
         )
 
     def discard_received(self, now_ns: int) -> None:
         """The computer stood still until now: images, poses and velocities from before are outdated."""
-        self._valid_from_ns, self._obstacles = now_ns, None
-        self.steering.discard_received()
+        for camera in self._cameras.values():
+            camera.discard_received(now_ns)
         self._markers.discard_received()
         self.poses.discard_received(now_ns)
         self.velocities.discard_received(now_ns)

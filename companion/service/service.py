@@ -237,7 +237,10 @@ class Service:
             markers = self.inputs.on_result(camera, result)
             if markers is not None and markers.vision is not None:
                 self.driver.send_vision_position(markers.vision)
-            localization = Localization(camera.targets, camera.localization_error, fused=camera.fused)
+            if camera.repeats:  # the targets are those of an earlier result
+                localization = Localization(error="no new image")
+            else:
+                localization = Localization(camera.targets, camera.localization_error, fused=camera.fused)
             if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:

@@ -141,6 +141,8 @@ class StatusCameraBody(TypedDict):
     """frames lost unintentionally"""
     frames_skipped: dict[str, int]
     """reason: frames without a message"""
+    frames_repeated: dict[str, int]
+    """image or depth: frames identical to the one before"""
     stuck_after_s: float | None
     """silence after which the process is restarted"""
     class_names: list[str]

@@ -29,6 +29,7 @@ from companion.guidance.motion import (
 )
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.chosen import Wanted
+from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.target import RangeSource, Target
 from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.gimbal import GimbalAim
@@ -183,6 +184,10 @@ class ApproachBehaviour(Behaviour):
         setpoint = Setpoint.velocity((*wanted, down_mps), now_ns, yaw_rad=self._bearing_rad)
         stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
         return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)
+
+    @property
+    def approached(self) -> Approached | None:
+        return None if self._track is None else Approached(self._track.newest)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

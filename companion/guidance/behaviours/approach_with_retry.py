@@ -29,6 +29,7 @@ from companion.guidance.gimbal.pitch import (
 )
 from companion.guidance.motion import position_and_yaw, stay_at
 from companion.guidance.search_pattern import field_of_view_rad
+from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -163,6 +164,10 @@ class PersistentApproach(Behaviour):
         if not context.perception_fresh:
             return Outcome(False, f"{self._why}; {step.reason}")
         return self._look_again(context)
+
+    @property
+    def approached(self) -> Approached | None:
+        return None if self._approach is None else self._approach.approached
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

@@ -199,7 +199,7 @@ class FollowBehaviour(Behaviour):
             if why is not None:
                 return Outcome(False, f"follow lost the gimbal: {why}")
         height_mps = correction(self._down_m - position[2])
-        if track is None:
+        if track is None or context.camera_fault:  # a prediction is for a hidden object, not for no camera
             if self._yaw_rad is None:
                 return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rate_radps=0.0)
             return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rad=self._yaw_rad)

@@ -24,6 +24,8 @@ from companion.guidance.behaviour import (
 from companion.guidance.behaviours.marker_search import MarkerSearch
 from companion.guidance.command import BuildContext, Command, EnumArgument, GrammarError, Number, behaviour
 from companion.guidance.motion import correction, position_and_yaw, towards
+from companion.guidance.targets.closing_check import Approached
+from companion.guidance.targets.from_markers import MarkerTarget
 from companion.guidance.targets.pad_filter import PadFilter
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -134,6 +136,7 @@ class LandOnMarkerBehaviour(Behaviour):
         self._attempts, self._search_m, self._speed_mps = attempts, search_m, speed_mps
         self._pad: PadFilter | None = None
         self._target: LandingTarget | None = None
+        self._marker: MarkerTarget | None = None
         self._phase = _Phase.SEARCH
         self._search: MarkerSearch | None = None
         self._started_down_m = self._goal_down_m = 0.0
@@ -171,6 +174,10 @@ class LandOnMarkerBehaviour(Behaviour):
         return _STEPS[self._phase](self, dt_s, context, position)
 
     @property
+    def approached(self) -> Approached | None:
+        return None if self._marker is None else Approached(self._marker.as_target(), moves=self._moving)
+
+    @property
     def landing_target(self) -> LandingTarget | None:
         return self._target if self._by_autopilot else None
 
@@ -205,6 +212,7 @@ class LandOnMarkerBehaviour(Behaviour):
                 self._pad = PadFilter(target, moving=self._moving)
             elif not self._pad.add(target):
                 continue
+            self._marker = target
             self._target = LandingTarget(
                 target.captured_ns,
                 self._identifier,
@@ -250,7 +258,8 @@ class LandOnMarkerBehaviour(Behaviour):
             return self._descending(dt_s, context, position)
         if self._blind_since_ns is not None:
             if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-                return Outcome(False, f"no camera frames for {BLIND_TIMEOUT_S:g} s")
+                why = context.markers.fault or f"no camera frames for {BLIND_TIMEOUT_S:g} s"
+                return Outcome(False, why + self._so_far())
             return Setpoint.brake(now_ns)
         search = self._search
         assert search is not None
@@ -266,7 +275,8 @@ class LandOnMarkerBehaviour(Behaviour):
         assert pad is not None
         unseen_s = pad.unseen_s(now_ns)
         if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
-            return self._climb(f"lost {self._height_m:.1f} m above it", context, position)
+            why = f" ({context.markers.fault})" if context.markers.fault else ""
+            return self._climb(f"lost {self._height_m:.1f} m above it{why}", context, position)
         point, drift = pad.at(now_ns), pad.velocity_mps
         error_m = math.dist(point[:2], position[:2])
         if self._height_m <= FINAL_M:

@@ -24,6 +24,7 @@ from companion.guidance.command import (
     names_in,
 )
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
+from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -184,6 +185,10 @@ class PatrolBehaviour(Behaviour):
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
             return Outcome(True, f"{step.reason}, {stops}")
         return step
+
+    @property
+    def approached(self) -> Approached | None:
+        return None if self._approach is None else self._approach.approached
 
     @property
     def status(self) -> str:

@@ -29,6 +29,7 @@ from companion.guidance.motion import Arrival, position_and_yaw, speed_of
 from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
 from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.chosen import Wanted
+from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -163,7 +164,8 @@ class PolicyBehaviour(Behaviour):
         if elapsed_s > self._limit_s:
             return Outcome(False, f"not there after {elapsed_s:.0f} s: {self._range_m:.1f} m away")
         if (fault := self._untrained(values)) is not None:
-            return Outcome(False, f"{self._policy.name} ended: {fault}")
+            why = context.perception_fault("")
+            return Outcome(False, f"{self._policy.name} ended: {fault}" + (f" ({why})" if why else ""))
         if lost:
             return self._wait(dt_s, context)
         self._hold = None
@@ -225,6 +227,10 @@ class PolicyBehaviour(Behaviour):
                 return f"its action {quantity.name} is {value}"
             self._action[quantity.name] = _clipped(quantity, value)
         return None
+
+    @property
+    def approached(self) -> Approached | None:
+        return None if self._track is None else Approached(self._track.newest)
 
     @property
     def status(self) -> str:

@@ -82,7 +82,7 @@ class ObstacleRules:
         relied_on = self.use == "required" or (self.use == "auto" and context.obstacles is not None)
         if not relied_on or self.fresh(context):
             return None
-        return f"no depth: {_age(context.obstacles, context.now_ns)}"
+        return f"no depth: {context.camera_fault or _age(context.obstacles, context.now_ns)}"
 
     def constraints(self, context: BehaviourContext) -> tuple[Constraint, ...]:
         """(north, east) unit direction and the speed allowed in it, for every limiting sector."""

@@ -186,6 +186,7 @@ class MarkerSight:
         age_s: since then; None: none received.
         fresh: that age is within the configured maximum.
         missing: what is missing for using markers; empty: nothing.
+        fault: why nothing that a camera shows is used; empty: it is.
     """
 
     targets: tuple[MarkerTarget, ...] = ()
@@ -193,6 +194,7 @@ class MarkerSight:
     age_s: float | None = None
     fresh: bool = False
     missing: str = "marker detection (markers.dictionary is not set)"
+    fault: str = ""
 
     def unavailable(self, gap_s: float) -> str | None:
         """What is missing, in words; None: nothing. A camera may be late by `gap_s`."""
@@ -201,7 +203,7 @@ class MarkerSight:
         if self.age_s is None:
             return "marker detections (none received yet)"
         if not self.fresh and self.age_s > gap_s:
-            return f"marker detections (newest frame {self.age_s:.1f} s old)"
+            return f"marker detections ({self.fault or f'newest frame {self.age_s:.1f} s old'})"
         return None
 
 
