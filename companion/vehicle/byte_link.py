@@ -14,11 +14,11 @@ import logging
 import os
 import socket
 import termios
-import time
 import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from companion.clock import boottime_ns
 from companion.tasks import spawn
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import LinkScheme, LinkUrl
@@ -184,7 +184,7 @@ class _StreamLink:
         self._loop = asyncio.get_running_loop()
         self._descriptor = -1
         self._unsent = b""  # the rest of a partially sent frame
-        self._unsent_since_s = 0.0
+        self._unsent_since_ns = 0
         self._reopening: asyncio.Task[None] | None = None
         self.dropped_count = 0
 
@@ -227,17 +227,17 @@ class _StreamLink:
             return
         was_waiting, self._unsent = bool(self._unsent), data[written:]
         if self._unsent and not was_waiting:
-            self._unsent_since_s = time.monotonic()
+            self._unsent_since_ns = boottime_ns()
             self._loop.add_writer(self._descriptor, self._write_rest)
         elif was_waiting and not self._unsent:
             self._loop.remove_writer(self._descriptor)
 
     def _write_rest(self) -> None:
-        waited_s = time.monotonic() - self._unsent_since_s
+        waited_s = (boottime_ns() - self._unsent_since_ns) / 1e9
         if waited_s <= _PARTIAL_FRAME_S:
             self._write(self._unsent)
             return
-        # This process or the line was stopped. The frame may be a setpoint: it must not be completed now.
+        # The line, this process or the computer stood still. The frame may be a setpoint: not completed now.
         logger.warning("%s: partial frame dropped after %.1f s", self._url, waited_s)
         self.dropped_count += 1
         self._unsent = b""

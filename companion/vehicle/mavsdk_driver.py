@@ -15,7 +15,6 @@ import asyncio
 import ctypes
 import json
 import logging
-import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -113,10 +112,10 @@ class MavsdkDriver(AutopilotDriver):
             logger.debug("%s: dropped a call of MAVSDK after the loop had closed", self.url)
 
     def _library_sends(self, data: bytes) -> None:
-        self._hop(self._transmit_for_library, data, time.monotonic_ns())
+        self._hop(self._transmit_for_library, data, self.watch.now_ns())
 
     def _transmit_for_library(self, data: bytes, handed_over_ns: int) -> None:
-        if time.monotonic_ns() - handed_over_ns > _STALE_NS:
+        if self.watch.now_ns() - handed_over_ns > _STALE_NS:
             logger.warning("%s: the loop hung; dropped what MAVSDK sent meanwhile", self.url)
             return
         for frame in frames_of(data):

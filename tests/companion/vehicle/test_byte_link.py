@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import logging
 import os
 import pty
@@ -114,8 +115,9 @@ async def test_tcp_link_is_reopened_after_a_loss(caplog: pytest.LogCaptureFixtur
 async def test_delayed_rest_of_a_frame_is_dropped(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As after SIGSTOP in the middle of a setpoint, on a full line."""
-    monkeypatch.setattr("companion.vehicle.byte_link._PARTIAL_FRAME_S", -1.0)
+    """As after a suspend or SIGSTOP in the middle of a setpoint, on a full line."""
+    seconds = itertools.count()
+    monkeypatch.setattr("companion.vehicle.byte_link.boottime_ns", lambda: next(seconds) * 10**9)
     listener = socket.socket()
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     listener.bind(("127.0.0.1", 0))
