@@ -9,7 +9,9 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.guidance.behaviour import Outcome
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.autopilot_profile import Px4Profile
+from companion.vehicle.driver import CommandRefusedError
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 
@@ -151,3 +153,19 @@ def test_takeoff_counts_from_home_as_moved_by_arming(up_m: float) -> None:
     assert altitude_m == pytest.approx(5.0, abs=0.3)
     assert float(outcome.reason.split()[2]) == pytest.approx(altitude_m, abs=0.1)
     assert flight.vehicle.truth.height_m == pytest.approx(5.0, abs=0.4)
+
+
+def test_takeoff_refused_after_arming_disarms_the_vehicle(monkeypatch: pytest.MonkeyPatch) -> None:
+    flight = on_ground()
+
+    def refuse(profile: Px4Profile, altitude_m: float, state: VehicleState) -> tuple[float, ...]:
+        assert state.armed
+        raise CommandRefusedError("home position not received")
+
+    monkeypatch.setattr(Px4Profile, "takeoff_parameters", refuse)
+    outcome = flight.fly("takeoff 4", 30.0).outcome
+    assert outcome is not None
+    assert not outcome.success
+    # Long before PX4 would disarm by itself (COM_DISARM_PRFLT, 10 s).
+    assert flight.run_until(lambda: not flight.state.armed, 3.0)
+    assert flight.state.landed is LandedState.ON_GROUND
