@@ -1,0 +1,103 @@
+"""ONNX files that ask for too much: small, and valid by their form."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vision.runtimes import onnx_trial
+from vision.runtimes.base import RuntimeUnusableError
+from vision.runtimes.onnx_runtime import onnx_facts, open_session
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+
+
+def save(path: Path, nodes: list[object], functions: list[object], initializers: list[object]) -> Path:
+    """Write a network from `x` to `o`, one float each."""
+    helper = onnx.helper
+    ports = [helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1]) for name in ("x", "o")]
+    graph = helper.make_graph(nodes, "g", ports[:1], ports[1:], initializers)
+    imports = [helper.make_opsetid("", 17), helper.make_opsetid("d", 1)]
+    onnx.save(helper.make_model(graph, functions=functions, opset_imports=imports, ir_version=8), path)
+    return path
+
+
+def constants(path: Path, number: int) -> Path:
+    """A file whose constants take 0.9 GB each when they are computed."""
+    helper = onnx.helper
+    size = helper.make_tensor("s", onnx.TensorProto.INT64, [1], [225_000_000])
+    one = helper.make_tensor("v", onnx.TensorProto.FLOAT, [1], [1.0])
+    nodes, last = [], "x"
+    for index in range(number):
+        nodes.append(helper.make_node("ConstantOfShape", ["s"], [f"y{index}"], value=one))
+        nodes.append(helper.make_node("Gather", [f"y{index}", "i"], [f"z{index}"]))
+        nodes.append(helper.make_node("Add", [last, f"z{index}"], [f"a{index}"]))
+        last = f"a{index}"
+    nodes.append(helper.make_node("Gather", [f"y{number - 1}", "k"], ["q"]))
+    nodes.append(helper.make_node("Add", [last, "q"], ["o"]))
+    index_of = helper.make_tensor("i", onnx.TensorProto.INT64, [1], [0])
+    return save(path, nodes, [], [size, index_of, helper.make_tensor("k", onnx.TensorProto.INT64, [1], [1])])
+
+
+def nested(path: Path, depth: int) -> Path:
+    """Functions that each contain the one before twice."""
+    helper = onnx.helper
+    imports = [helper.make_opsetid("", 17), helper.make_opsetid("d", 1)]
+    functions = []
+    for level in range(depth):
+        inner = f"f{level - 1}"
+        nodes = [helper.make_node("Relu", ["x"], ["y"])]
+        if level:
+            pairs = (("x", "a"), ("a", "y"))
+            nodes = [helper.make_node(inner, [one], [other], domain="d") for one, other in pairs]
+        functions.append(helper.make_function("d", f"f{level}", ["x"], ["y"], nodes, imports))
+    return save(path, [helper.make_node(f"f{depth - 1}", ["x"], ["o"], domain="d")], functions, [])
+
+
+def test_network_that_takes_gigabytes_is_refused(tmp_path: Path) -> None:
+    path = constants(tmp_path / "large.onnx", 4)
+    assert path.stat().st_size < 2000
+    for load in (lambda: onnx_facts(path), lambda: open_session(path, 1)):
+        with pytest.raises(RuntimeUnusableError) as caught:
+            load()
+        assert str(path) in str(caught.value)
+        assert "MiB" in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_network_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(onnx_trial, "LOAD_S", 5.0)
+    path = nested(tmp_path / "nested.onnx", 40)
+    with pytest.raises(RuntimeUnusableError, match=r" 5 s"):
+        open_session(path, 1)
+
+
+def test_usable_network_is_tried_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = nested(tmp_path / "small.onnx", 3)
+    session, _ = open_session(path, 1)
+    assert session.run(None, {"x": np.ones(1, np.float32)})[0].tolist() == [1.0]
+
+    def run(*_: object, **__: object) -> None:
+        raise AssertionError("it is not tried again")
+
+    monkeypatch.setattr("vision.runtimes.onnx_trial.subprocess.run", run)
+    open_session(path, 1)
+    path.write_bytes(path.read_bytes() + b"\x00")
+    with pytest.raises(AssertionError):
+        open_session(path, 1)
+
+
+@pytest.mark.parametrize("content", [b"", b"not a network"])
+def test_other_errors_are_those_of_the_runtime(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "other.onnx"
+    path.write_bytes(content)
+    with pytest.raises(RuntimeUnusableError, match="onnxruntime cannot load it"):
+        open_session(path, 1)

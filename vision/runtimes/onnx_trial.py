@@ -1,0 +1,109 @@
+"""Loads an ONNX file in a process of its own first: a few hundred bytes may ask for gigabytes, or never end.
+
+Nothing in the file says what loading takes: constants are computed, and functions are expanded in each other.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import subprocess
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from vision.runtimes.base import RuntimeUnusableError
+from vision.runtimes.stored_choice import cache_folder
+
+LOAD_S = 60.0
+"""A network of 270 MB takes 4 s on two cores."""
+MEMORY_BYTES, MEMORY_PER_BYTE = 1 << 30, 8
+"""What loading may take beside ONNX Runtime itself, and for each byte of the file."""
+_TOO_LARGE = 3  # exit code
+_ERRORS_ONLY = 3
+
+
+def check_load(path: Path) -> None:
+    """Check that a file is loaded within the limits; what else is wrong with it is for the caller to find.
+
+    A file that was is not tried again.
+
+    Raises:
+        RuntimeUnusableError: it takes too long or too much memory, or ends the process.
+    """
+    try:
+        marker = cache_folder() / f"onnx-{_digest(path)}.loads"
+        if marker.exists():
+            return
+        command = [sys.executable, "-m", "vision.runtimes.onnx_trial", str(path)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        done = subprocess.run(command, capture_output=True, timeout=LOAD_S, check=False, env=environment)
+    except subprocess.TimeoutExpired:
+        raise RuntimeUnusableError(
+            f"{path}: onnxruntime has not loaded it within {LOAD_S:g} s: it is damaged or made to harm; "
+            "export it again"
+        ) from None
+    except OSError as error:
+        raise RuntimeUnusableError(f"{path}: cannot be read: {error.strerror or error}") from error
+    if done.returncode == _TOO_LARGE:
+        raise RuntimeUnusableError(
+            f"{path}: onnxruntime needs more than {_allowed(path) >> 20} MiB to load it: it is damaged or "
+            "made to harm; export it again"
+        )
+    if done.returncode != 0:
+        last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no output"])[-1]
+        raise RuntimeUnusableError(
+            f"{path}: onnxruntime ends with code {done.returncode} when it loads it: {last[:200]}"
+        )
+    with contextlib.suppress(OSError):  # it is tried again next time
+        marker.parent.mkdir(parents=True, exist_ok=True)
+        marker.touch()
+
+
+def _digest(path: Path) -> str:
+    """Return what identifies the file and the runtime that loads it."""
+    try:
+        runtime = version("onnxruntime")
+    except PackageNotFoundError:  # another package of it, for GPUs
+        runtime = ""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256")
+    digest.update(runtime.encode())
+    return digest.hexdigest()[:32]
+
+
+def _allowed(path: Path) -> int:
+    return MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
+
+
+def _limit_memory(more_bytes: int) -> None:
+    """Limit the address space to what is in use and some more; where the system has no such limit, not."""
+    with contextlib.suppress(ImportError, OSError, ValueError):
+        import resource
+
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        limit = pages * resource.getpagesize() + more_bytes
+        resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+
+
+def main(path: str) -> int:
+    """Load the file; returns the exit code."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = _ERRORS_ONLY
+    options.intra_op_num_threads = 1  # each thread reserves address space
+    _limit_memory(_allowed(Path(path)))
+    try:
+        onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except MemoryError:
+        return _TOO_LARGE
+    except Exception as error:
+        text = str(error).lower()
+        return _TOO_LARGE if "alloc" in text or "memory" in text else 0
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1]))
