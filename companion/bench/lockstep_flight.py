@@ -131,7 +131,7 @@ class LockstepFlight:
             settings, perceived, lambda level, text: self.notes.append((level, text))
         )
         if isinstance(driver, SimulatedDriver):
-            self.inputs.altitude_acceptance_m = driver.altitude_acceptance_m
+            self.inputs.parameters = driver.parameters
         self.guidance = Guidance(options or guidance_options(settings, COMPANION))
         self.streamer = streamer_of(settings, driver.send_setpoint, lambda: driver.now_ns)
         self.events: list[GuidanceEvent] = []

@@ -21,6 +21,7 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.vehicle.ardupilot_profile import ArduPilotProfile
+from companion.vehicle.autopilot_parameters import AutopilotParameters, FirmwareVersion, parameter_names
 from companion.vehicle.autopilot_profile import HOME_POSITION_ID, AutopilotProfile, Px4Profile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.gimbal_commands import CONFIGURE, PITCHYAW, RELEASE, UNCHANGED, pitchyaw_parameters
@@ -46,6 +47,7 @@ from companion.vehicle.vision_position import VisionPosition, vision_position_fi
 from mavlink_sim.lockstep import COMPANION, LockstepVehicle
 from mavlink_sim.services.vehicle_files import event_metadata
 from mavlink_sim.vehicles.ardupilot.copter import CopterVehicle
+from mavlink_sim.vehicles.ardupilot.telemetry import VERSION as COPTER_VERSION
 from mavlink_sim.wire.messages import dialect
 from vision.obstacle_sectors import ObstacleSectors
 
@@ -156,9 +158,13 @@ class SimulatedDriver:
         return self._state
 
     @property
-    def altitude_acceptance_m(self) -> float | None:
-        """As the service reads it when the link has opened (`companion.service.health`)."""
-        return None if self._kind == ARDUPILOT else self.vehicle.vehicle.parameters.number("NAV_MC_ALT_RAD")
+    def parameters(self) -> AutopilotParameters:
+        """As the service reads them when the link has opened (`companion.service.health`)."""
+        vehicle, name = self.vehicle.vehicle, self._profile.name
+        encoded = COPTER_VERSION if self._kind == ARDUPILOT else vehicle.release.software_version
+        version = FirmwareVersion.of(encoded)
+        values = tuple((key, vehicle.parameters.number(key)) for key in parameter_names(name, version))
+        return AutopilotParameters(name, version, vehicle.system_id, values)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
         moved = setpoint.moved(self._state.reset_offset_ned_m)

@@ -21,8 +21,10 @@ from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.pose_sharing import PoseSharing
 from companion.perception.cameras import PerceptionCamera, WorkerCamera
 from companion.perception.supervisor import PerceptionSupervisor
+from companion.vehicle.autopilot_parameters import AutopilotParameters
 from companion.vehicle.driver import Driver
 from companion.vehicle.gimbal import address_text
+from companion.vehicle.silence import silence_outcome
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
@@ -40,6 +42,7 @@ def status_message(
     cameras: Sequence[WorkerCamera],
     steering: PerceptionCamera,
     poses: PoseSharing,
+    parameters: AutopilotParameters,
     bus: Bus,
     others: list[OtherCommanderBody],
     dropped_lines: int,
@@ -48,9 +51,10 @@ def status_message(
 
     Args:
         now_ns: CLOCK_MONOTONIC. steering: the camera that guidance uses. others: services that command the
-            same vehicle. dropped_lines: of the log.
+            same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
-    state, limits = driver.state, guidance.options.limits
+    state, limits = driver.state, guidance.limits
+    silence = silence_outcome(parameters, sticks_present=state.sticks_present)
     return {
         "stamp_ns": now_ns,
         "service": poses.source,
@@ -60,11 +64,20 @@ def status_message(
             "name": poses.vehicle,
             "connected": state.connected(now_ns),
             "autopilot": state.autopilot,
+            "firmware": None if parameters.version is None else str(parameters.version),
             "driver": driver.library,
             "mode": state.mode.value,
             "armed": state.armed,
             "failsafe": state.failsafe,
             "not_flown": state.not_flown,
+            "sticks": parameters.sticks_text,
+            "silence": {
+                "effect": silence.effect.value,
+                "mode": silence.mode.value,
+                "after_s": None if silence.after_s is None else round(silence.after_s, 2),
+                "warning": silence.warning,
+                "text": silence.text,
+            },
             "missing_streams": list(state.missing_streams),
             "status_texts": [report.text for report in state.reports],
             "other_commanders": others,
@@ -79,6 +92,9 @@ def status_message(
         "limits": {
             "max_distance_m": limits.max_distance_m,
             "max_altitude_m": limits.max_altitude_m,
+            "max_horizontal_speed_mps": limits.max_horizontal_speed_mps,
+            "max_climb_mps": limits.max_climb_mps,
+            "max_descend_mps": limits.max_descend_mps,
             "fence_include": _corners(limits.fence.include),
             "fence_exclude": [_corners(polygon) for polygon in limits.fence.exclude],
         },

@@ -81,8 +81,8 @@ class Authority:
             self._takeoff_altitude_m = altitude_m if altitude_m is not None else 0.0
             # Not below home: where the height has drifted, arming moves home.
             self._begun_altitude_m = max(state.altitude_m or 0.0, 0.0)
-            # From the ground, disarmed after our own landing.
-            self._was_armed = state.armed
+        # Disarmed after our own landing; a disarming in flight was noticed before.
+        self._was_armed &= state.armed
         self._mode = mode
         self._changed_ns = None
         self._leaving_until_ns = float("inf")
@@ -116,7 +116,7 @@ class Authority:
 
         Args:
             sent: the setpoint the vehicle should fly now; None: none. landing: it leads to the ground.
-            altitude_acceptance_m: as in `GuidanceInput`.
+            altitude_acceptance_m: how far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known.
         """
         self._acceptance_m = altitude_acceptance_m
         if altitude_acceptance_m is not None and not 0.0 <= altitude_acceptance_m <= LARGEST_ACCEPTANCE_M:
@@ -229,7 +229,7 @@ class Authority:
         return accepted and state.autopilot == "PX4" and self._holds_after_takeoff(state, now_ns)
 
 
-def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | None:
+def silence(stream: StreamState, paused_s: float) -> str | None:
     """Why the setpoint stream was interrupted; None: it was not. `paused_s`: since the previous step.
 
     PX4 would resume OFFBOARD by itself if setpoints came back; only an operator may.
@@ -237,7 +237,7 @@ def silence(stream: StreamState, state: VehicleState, paused_s: float) -> str | 
     if paused_s > SILENCE_S:
         return f"guidance loop paused for {paused_s:.1f} s"
     if stream is StreamState.EXPIRED:
-        return f"setpoint stream interrupted: {state.without_setpoints}"
+        return "setpoint stream interrupted"
     return None
 
 

@@ -13,6 +13,7 @@ from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -113,6 +114,7 @@ class BehaviourContext:
         tracks: of the steering camera, those that have ended included.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
         camera_fault: why nothing that the steering camera shows is used; empty: it is.
+        parameters: of the autopilot.
 
     >>> from companion import BehaviourContext
     >>> from companion.vehicle.state import VehicleState
@@ -141,6 +143,7 @@ class BehaviourContext:
     avoiding: bool = False
     velocities: tuple[VelocityInput, ...] = ()
     camera_fault: str = ""
+    parameters: AutopilotParameters = NOTHING_READ
 
     def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""
@@ -185,7 +188,8 @@ class Outcome:
 class ModeRequest:
     """Request one of the autopilot's own modes (take-off, land, return, hold) until the next output.
 
-    `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm`: arm first (only take-off does).
+    `altitude_m` is for FlightMode.TAKEOFF: height above home. `arm`: arm first, in HOLD. Only TAKEOFF does,
+    and HOLD, from which a take-off climbs by setpoints.
 
     >>> from companion import ModeRequest
     >>> from companion.vehicle.state import FlightMode

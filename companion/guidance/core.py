@@ -105,6 +105,11 @@ class Guidance:
         return self._options
 
     @property
+    def limits(self) -> Limits:
+        """The limits of setpoints: the operator's, within the autopilot's."""
+        return self._setpoints.limits
+
+    @property
     def active(self) -> Behaviour | None:
         """The active behaviour, inside a sequence its current one; None: none has been updated yet."""
         return self._runner.active
@@ -177,6 +182,7 @@ class Guidance:
         """
         out = self._out
         out.begin(now_ns)
+        self._setpoints.use_autopilot(inputs.parameters)
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
@@ -279,6 +285,7 @@ class Guidance:
             avoiding=self.options.avoid,
             velocities=inputs.velocities,
             camera_fault=inputs.camera_fault,
+            parameters=inputs.parameters,
         )
         fault = self._check_closing(inputs.state, targets)
         return context if not fault else _blinded(context, fault)

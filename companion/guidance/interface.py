@@ -14,6 +14,7 @@ from companion.guidance.targets.chosen import GimbalGoal
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.targets.target import Target
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -198,7 +199,7 @@ class GuidanceInput:
         ending: the service ends: no command begins, and control is released.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
         camera_fault: why nothing that the steering camera shows is used, in words; empty: it is.
-        altitude_acceptance_m: how far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known.
+        parameters: what was read from the autopilot when the link opened or returned.
         standstill: of the computer or the process, since the previous step; None: none.
     """
 
@@ -219,7 +220,7 @@ class GuidanceInput:
     ending: bool = False
     steering_markers: MarkerSight = NO_MARKERS
     velocities: tuple[VelocityInput, ...] = ()
-    altitude_acceptance_m: float | None = None
+    parameters: AutopilotParameters = NOTHING_READ
     standstill: Standstill | None = None
     camera_fault: str = ""
 

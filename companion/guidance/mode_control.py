@@ -8,6 +8,7 @@ from companion.guidance.authority import Authority, silence
 from companion.guidance.behaviour import BehaviourContext, ModeRequest
 from companion.guidance.interface import Answer, Arm, Disarm, GuidanceInput, OutputCollector, SetMode, TakeOff
 from companion.guidance.setpoint_output import SetpointOutput
+from companion.vehicle.silence import silence_outcome
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import StreamState
 
@@ -82,7 +83,12 @@ class ModeControl:
         """Why command was lost; None while in command. Call it once per step. `paused_s`: since the last."""
         self._armed_on_ground &= context.state.landed is LandedState.ON_GROUND
         stream = inputs.stream.state
-        interrupted = silence(stream, context.state, paused_s) if self._setpoints.streaming else None
+        interrupted = None
+        if self._setpoints.streaming:
+            interrupted = silence(stream, paused_s)
+            if stream is StreamState.EXPIRED and interrupted is not None:
+                outcome = silence_outcome(inputs.parameters, sticks_present=context.state.sticks_present)
+                interrupted = f"{interrupted}: {outcome.text}"
         active = stream is StreamState.FRESH and self.phase is Phase.OFFBOARD
         return interrupted or self._authority.lost(
             context.state,
@@ -90,7 +96,7 @@ class ModeControl:
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
             sent=self._setpoints.sent if active else None,
             landing=landing,
-            altitude_acceptance_m=inputs.altitude_acceptance_m,
+            altitude_acceptance_m=inputs.parameters.altitude_acceptance_m,
         )
 
     def yield_command(self, why: str | None, context: BehaviourContext) -> str | None:
@@ -206,20 +212,23 @@ class ModeControl:
 
 
 class _ModeSequence:
-    """The actions of one mode request. Only a take-off with `arm` set arms."""
+    """The actions of one mode request. Only a take-off with `arm` set arms, by setpoints in HOLD."""
 
     def __init__(self, request: ModeRequest, state: VehicleState) -> None:
         self._actions: list[SetMode | Arm | TakeOff] = []
         self._waiting_since_ns: int | None = None
-        if request.mode is not FlightMode.TAKEOFF or request.altitude_m is None:
-            self._actions.append(SetMode(request.mode))
-            return
-        if request.arm and not state.armed:
+        arms = request.mode in (FlightMode.TAKEOFF, FlightMode.HOLD)
+        if request.arm and arms and not state.armed:
             # After a landing PX4 may show the mode from before the landing, in which it does not arm.
             if state.mode is not FlightMode.HOLD:
                 self._actions.append(SetMode(FlightMode.HOLD))
             self._actions.append(Arm())
-        self._actions.append(TakeOff(request.altitude_m))
+            if request.mode is FlightMode.HOLD:
+                return
+        if request.mode is FlightMode.TAKEOFF and request.altitude_m is not None:
+            self._actions.append(TakeOff(request.altitude_m))
+        else:
+            self._actions.append(SetMode(request.mode))
 
     @property
     def finished(self) -> bool:

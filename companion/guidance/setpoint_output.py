@@ -9,8 +9,9 @@ from dataclasses import replace
 from companion.guidance.avoidance import Avoidance
 from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoint
 from companion.guidance.interface import EventKind, OutputCollector
-from companion.guidance.limits.envelope import Envelope, Limits
+from companion.guidance.limits.envelope import Envelope, Limits, within_autopilot
 from companion.guidance.limits.obstacles import Constraint, ObstacleMemory, ObstacleRules
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from vision.occupancy_grid import Point
@@ -43,11 +44,27 @@ class SetpointOutput:
         self._obstacles = obstacles
         self._lifetime_s = lifetime_s
         self._out = out
+        self._limits = limits
+        self._read = NOTHING_READ
         self._envelope = Envelope(limits)
         self._memory = ObstacleMemory()
         self._avoidance = Avoidance(obstacles.margin_m)
         self._constrained: tuple[BehaviourContext, tuple[Constraint, ...]] | None = None
         self._blind = False
+
+    @property
+    def limits(self) -> Limits:
+        """The limits of setpoints: the operator's, within the autopilot's."""
+        return self._envelope.limits
+
+    def use_autopilot(self, read: AutopilotParameters) -> None:
+        """Keep setpoints within the autopilot's own limits of speed; report once what they reduce."""
+        if read == self._read:
+            return
+        self._read = read
+        self._envelope.limits, words = within_autopilot(self._limits, read)
+        if words:
+            self._out.event(EventKind.NOTED, "", words)
 
     def begin(self) -> None:
         """A new behaviour begins."""

@@ -21,6 +21,7 @@ from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
+from companion.vehicle.silence import silence_outcome
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import Streamer, StreamState
 
@@ -126,7 +127,9 @@ class GuidanceLoop:
                 self._on_event("warning", f"shutdown: {error}")
                 await self._driver.settle()
             except CommandRefusedError as error:
-                self._on_event("error", f"shutdown: {error}; {self._driver.state.without_setpoints}")
+                sticks = self._driver.state.sticks_present
+                outcome = silence_outcome(self._inputs.parameters, sticks_present=sticks)
+                self._on_event("error", f"shutdown: {error}; {outcome.text}")
             finally:
                 await self.wait_released()
 

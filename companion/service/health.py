@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
+from typing import TypeVar
 
-from companion.guidance.authority import DEFAULT_ACCEPTANCE_M
 from companion.guidance.core import Guidance
 from companion.perception.cameras import WorkerCamera
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, parameter_names
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
+from companion.vehicle.silence import SilenceOutcome, silence_outcome
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vehicle_type import VTOL_STATE_MISSING
 
 HEARTBEAT_PERIOD_S = 1.0
 HUD_PERIOD_S = 0.2
-# ArduPilot's default, for which it continues a velocity; 1 s is advised (docs/safety.md).
-LONG_GUIDED_TIMEOUT_S = 3.0
+
+Read = TypeVar("Read")
 
 
 class Health:
@@ -46,6 +48,12 @@ class Health:
         self._not_flown: str | None = None
         self._link_count = 0
         self._check_due = asyncio.Event()
+        self._silence_of: tuple[AutopilotParameters, bool] | None = None
+
+    @property
+    def silence(self) -> SilenceOutcome:
+        """What the autopilot does without setpoints."""
+        return silence_outcome(self._inputs.parameters, sticks_present=self._driver.state.sticks_present)
 
     def healthy(self, now_ns: int) -> bool:
         """Whether every camera delivers results and the autopilot is connected."""
@@ -59,34 +67,47 @@ class Health:
             await self.check()
 
     async def check(self) -> None:
-        """Read the autopilot's parameters that matter here."""
-        autopilot = self._driver.state.autopilot
-        if autopilot == "PX4":
-            assumed = f"{DEFAULT_ACCEPTANCE_M:g} m assumed"
-            self._inputs.altitude_acceptance_m = await self._parameter("NAV_MC_ALT_RAD", assumed)
-        timeout_s = None
-        if autopilot == "ArduPilot":
-            timeout_s = await self._parameter("GUID_TIMEOUT", "check that it is 1")
-        if timeout_s is not None and timeout_s >= LONG_GUIDED_TIMEOUT_S:
-            self._on_event(
-                "warning",
-                f"GUID_TIMEOUT is {timeout_s:g} s: ArduPilot flies on for that long on silence; set it to 1",
-            )
+        """Read the autopilot's version and the parameters that matter here, and report what follows."""
+        autopilot, link_count = self._driver.state.autopilot, self._driver.link_count
+        if autopilot is None:
+            return
+        version = await self._read(self._driver.firmware_version())
+        names = parameter_names(autopilot, version)
+        values = await asyncio.gather(*(self._read(self._driver.get_parameter(name)) for name in names))
+        known = tuple((name, value) for name, value in zip(names, values, strict=True) if value is not None)
+        if self._driver.link_count != link_count:
+            return  # the next check reads again
+        system_id = self._driver.own_address[0]
+        read = self._inputs.parameters = AutopilotParameters(autopilot, version, system_id, known)
+        if (sticks := read.sticks_text) is not None:
+            self._on_event("info", sticks)
 
-    async def _parameter(self, name: str, otherwise: str) -> float | None:
-        """Return a parameter; None: it cannot be read, which is reported with what follows."""
+    async def _read(self, reading: Awaitable[Read]) -> Read | None:
+        """Return what was read; None: it cannot be read, which is reported."""
         try:
-            return await self._driver.get_parameter(name)
+            return await reading
         except CommandRefusedError as error:
-            self._on_event("warning", f"{error}: {otherwise}")
+            self._on_event("warning", f"{error}: not assumed; what depends on it is reported as not known")
             return None
+
+    def _report_silence(self) -> None:
+        """Report what the autopilot does without setpoints, again whenever it changes."""
+        read, state = self._inputs.parameters, self._driver.state
+        sticks = state.sticks_present
+        if read.autopilot is None or state.not_flown is not None or (read, sticks) == self._silence_of:
+            return
+        self._silence_of = (read, sticks)
+        outcome = self.silence
+        self._on_event("warning" if outcome.warning else "info", outcome.text)
 
     def after_step(self, now_ns: int, guidance: Guidance) -> None:
         """Run the periodic work; call after every step of guidance."""
         if self._driver.link_count != self._link_count:
             self._link_count = self._driver.link_count
-            self._inputs.altitude_acceptance_m = None  # it may have been changed meanwhile
+            self._inputs.parameters = NOTHING_READ  # they may have been changed meanwhile
+            self._silence_of = None
             self._check_due.set()
+        self._report_silence()
         linked = self._driver.state.connected(now_ns)
         if linked != self._linked:
             self._linked = linked

@@ -28,6 +28,7 @@ from companion.plugins import load_plugins
 from companion.recording.guidance_record import StepContext
 from companion.service.velocity_senders import VelocitySenders
 from companion.settings import CameraSection, Settings
+from companion.vehicle.autopilot_parameters import NOTHING_READ
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -56,7 +57,7 @@ class InputAssembler:
         steering: the camera whose targets behaviours get.
         history: the vehicle's states of the last few seconds.
         poses: the other vehicles. velocities: the messages on the topic `velocity`.
-        altitude_acceptance_m: as in `GuidanceInput`.
+        parameters: as in `GuidanceInput`.
     """
 
     def __init__(
@@ -69,7 +70,7 @@ class InputAssembler:
         self.history = StateHistory()
         self.poses = PoseSharing(settings.vehicle.name, on_event)
         self.velocities = VelocitySenders()
-        self.altitude_acceptance_m: float | None = None
+        self.parameters = NOTHING_READ
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
         self._shown: tuple[FlightMode, bool] | None = None
@@ -157,7 +158,7 @@ class InputAssembler:
             ending,
             self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
             self.velocities.newest(now_ns),
-            self.altitude_acceptance_m,
+            self.parameters,
             standstill,
             steering.frozen(now_ns),
         )

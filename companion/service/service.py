@@ -202,6 +202,7 @@ class Service:
             cameras=self.cameras,
             steering=self.inputs.steering,
             poses=self.inputs.poses,
+            parameters=self.inputs.parameters,
             bus=self.bus,
             others=self.others.status(self.driver.state, now_ns),
             dropped_lines=self._dropped_lines(),

@@ -19,6 +19,7 @@ from typing import Any
 
 from companion.clock import StandstillWatch
 from companion.tasks import spawn
+from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
@@ -32,6 +33,7 @@ from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.harmless import is_harmless
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
+from companion.vehicle.mav_result import result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
@@ -62,6 +64,10 @@ _TIMESYNC_ID = 111
 _SYSTEM_TIME_ID = 2
 _SYSTEM_TIME = struct.Struct("<QI")  # time_unix_usec, time_boot_ms
 _SETPOINT_ID = 84  # SET_POSITION_TARGET_LOCAL_NED
+_AUTOPILOT_VERSION_ID = 148
+_AUTOPILOT_VERSION = struct.Struct("<QQI")  # capabilities, uid, flight_sw_version; the rest is not read
+_REQUEST_MESSAGE = 512
+_VERSION_TIMEOUT_S = 2.0
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
 _TIMESYNCS_KEPT = 8  # those of the last 4 s
@@ -117,6 +123,8 @@ class AutopilotDriver(ABC):
         self._timesync_sent_ns = 0
         self._timesyncs_ns: deque[int] = deque(maxlen=_TIMESYNCS_KEPT)
         self._heartbeat_received = asyncio.Event()
+        self._version: FirmwareVersion | None = None
+        self._version_received = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
         self._time_sent_ns = 0
         self._signs = False  # the autopilot's frames are signed
@@ -275,6 +283,10 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == _SYSTEM_TIME_ID:
                         _, boot_ms = _SYSTEM_TIME.unpack(frame.padded(_SYSTEM_TIME.size))
                         self._telemetry.watch_clock("SYSTEM_TIME", boot_ms, time.monotonic_ns())
+                    elif frame.message_id == _AUTOPILOT_VERSION_ID:
+                        _, _, encoded = _AUTOPILOT_VERSION.unpack(frame.padded(_AUTOPILOT_VERSION.size))
+                        self._version = FirmwareVersion.of(encoded)
+                        self._version_received.set()
                     elif frame.message_id == CURRENT_MODE_ID:
                         self._current_mode_from(frame)
                         continue
@@ -562,6 +574,14 @@ class AutopilotDriver(ABC):
     async def settle(self) -> None:
         """See Driver."""
         await self._flight_commands.settled()
+
+    async def firmware_version(self) -> FirmwareVersion:
+        """See Driver."""
+        self._version_received.clear()
+        result = await self._command(_REQUEST_MESSAGE, _AUTOPILOT_VERSION_ID)
+        if not await _wait_event(self._version_received, _VERSION_TIMEOUT_S) or self._version is None:
+            raise CommandRefusedError(f"firmware version: no AUTOPILOT_VERSION ({result_name(result)})")
+        return self._version
 
     @property
     def own_address(self) -> Address:

@@ -11,6 +11,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from companion.clock import StandstillWatch
+from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -174,6 +175,9 @@ class Driver(Protocol):
 
     async def give_gimbal_back(self) -> None:
         """Release primary control if it is ours; the gimbal keeps its aim. Raises CommandRefusedError."""
+
+    async def firmware_version(self) -> FirmwareVersion:
+        """Return the autopilot's version (AUTOPILOT_VERSION). Raises CommandRefusedError if it sends none."""
 
     async def get_parameter(self, name: str) -> float:
         """Return the value of one parameter. Raises CommandRefusedError if it does not exist."""

@@ -41,10 +41,6 @@ Quaternion = tuple[float, float, float, float]
 TELEMETRY_MAX_AGE_S = 0.5
 # HEARTBEAT is sent once a second; three missing ones are the usual criterion of a lost link.
 HEARTBEAT_MAX_AGE_S = 3.0
-_WITHOUT_SETPOINTS = {
-    "PX4": "PX4 leaves OFFBOARD after COM_OF_LOSS_T and performs COM_OBL_RC_ACT",
-    "ArduPilot": "ArduPilot stops after GUID_TIMEOUT and stays in GUIDED",
-}
 
 
 class FlightMode(StrEnum):
@@ -130,6 +126,7 @@ class VehicleState:
         custom_mode: the autopilot's own number of `mode`, as it reports it.
         mode_restored: in words, the newest request to return to a pilot's mode that a message of ours had
             overridden; empty: none.
+        sticks_present: the autopilot has valid input of a pilot's sticks.
         intended_mode: the mode chosen last by the pilot or a command. A failsafe changes only `mode`.
         intended_beside: the `mode` reported together with the intended one. Both are UNKNOWN on an autopilot
             that does not report it (CURRENT_MODE: PX4 1.15 and newer).
@@ -153,6 +150,7 @@ class VehicleState:
     landed: LandedState = LandedState.UNKNOWN
     ready_to_arm: bool = False
     failsafe: bool = False
+    sticks_present: bool = False
     intended_mode: FlightMode = FlightMode.UNKNOWN
     intended_beside: FlightMode = FlightMode.UNKNOWN
     position_ned_m: Vector3 | None = None
@@ -248,13 +246,6 @@ class VehicleState:
                 f"the autopilot was {self.autopilot} and is {now} now: another vehicle; restart the service"
             )
         return why_not_flown(self.mav_type, self.mav_autopilot, self.vtol_state)
-
-    @property
-    def without_setpoints(self) -> str:
-        """What the autopilot does when setpoints stop, as text."""
-        if self.not_flown is not None:
-            return "what the vehicle does next is its autopilot's own"
-        return _WITHOUT_SETPOINTS.get(self.autopilot or "", "the autopilot performs its configured failsafe")
 
     def connected(self, now_ns: int) -> bool:
         """Whether a heartbeat was received within `HEARTBEAT_MAX_AGE_S`."""

@@ -34,6 +34,7 @@ from mavlink_sim.px4.modes import (
     base_mode,
 )
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.releases import Release
 from mavlink_sim.wire.announcements import (
     ARMED_EVENT,
     ARMING_DENIED_EVENT,
@@ -78,6 +79,7 @@ class Autopilot:
         local_frame: LocalFrame,
         ready_after_s: float,
         on_event: Callable[[str], None],
+        release: Release,
     ) -> None:
         self._airframe = airframe
         self._parameters = parameters
@@ -97,13 +99,14 @@ class Autopilot:
         self.home = Home(airframe)
         self.commands_handled = 0
         self.texts: deque[Text] = deque()
-        self.supervision = Supervision(self, parameters)
+        self.supervision = Supervision(self, parameters, release)
         self.gimbal_commands: deque[GimbalCommand] = deque()
         self.demand = Demand(0.0, 0.0, 0.0, 0.0)
         self._gimbal_schedule: deque[tuple[float, GimbalCommand]] = deque()
         self._takeoff_height_m: float | None = None
         self.task: flight.Task | None = None
         self._mode_after_disarming = Mode.HOLD
+        self._had_sticks = False
         self._last_setpoint_s = self._denied_sent_s = -math.inf
         self._setpoint_needs_position = False
         self._rates_alone = False  # the newest offboard setpoint was of body rates
@@ -390,6 +393,7 @@ class Autopilot:
         supervision, airframe = self.supervision, self._airframe
         supervision.update(dt_s, airframe)
         self._keep_landing()
+        self._follow_sticks()
         while self._gimbal_schedule and self._gimbal_schedule[0][0] <= self.now_s:
             self.gimbal_commands.append(self._gimbal_schedule.popleft()[1])
         if not self.armed or supervision.terminated:
@@ -546,6 +550,8 @@ class Autopilot:
                 self.task = flight.Offboard()
         elif self.mode is Mode.ORBIT:
             self.task = Orbit(airframe, parameters)
+        elif self.mode in MANUAL_MODES and not self.pilot_has_sticks:
+            self.task = position_failsafe.task_without_sticks(self.mode, airframe, parameters, self.demand)
         elif self.mode in MANUAL_MODES:
             self.task = manual_flight.task_of(
                 self.mode, airframe, parameters, self.supervision.read_sticks, self.stick_guard
@@ -577,6 +583,12 @@ class Autopilot:
             return  # it is down
         if descending is self.position_valid:
             self.task = self._landing_task()
+
+    def _follow_sticks(self) -> None:
+        """A mode of sticks is flown by another task while there are none."""
+        if self.mode in MANUAL_MODES and self.armed and self.pilot_has_sticks is not self._had_sticks:
+            self._start_task()
+        self._had_sticks = self.pilot_has_sticks
 
     def _takeoff_height(self) -> float:
         height = self._takeoff_height_m

@@ -2,7 +2,8 @@
 
 Every failed check has one action; the worst of all active actions is selected. Most actions first hold the
 position for COM_FAIL_ACT_T seconds, so that a pilot can take over. An action ends with its condition, or only
-with the next change of mode or disarming. The rules are those of PX4 v1.16/v1.17. Names in capitals are PX4's
+with the next change of mode or disarming. The rules are those of PX4 v1.14 to v1.18, which differ where
+`releases` says so. Names in capitals are PX4's
 parameters; times are seconds.
 """
 
@@ -16,6 +17,7 @@ from enum import Enum, IntEnum
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.releases import Release, SticksCheck
 from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
 
 
@@ -268,6 +270,7 @@ _EXCEPTION_BITS = {
 }
 
 
+_STICK_ACTIONS = (Action.FALLBACK_POSITION, Action.FALLBACK_ALTITUDE, Action.FALLBACK_STABILIZED)
 _RETURN = Response(Action.RETURN)
 _FALLBACKS = {action: Response(action, takeover=Takeover.ALWAYS) for action in Action}
 
@@ -282,9 +285,14 @@ class FailsafeMachine:
     """
 
     def __init__(
-        self, parameters: Parameters, can_fly: Callable[[Mode], bool], announce: Callable[[Text], None]
+        self,
+        parameters: Parameters,
+        can_fly: Callable[[Mode], bool],
+        announce: Callable[[Text], None],
+        release: Release,
     ) -> None:
         self._parameters = parameters
+        self._release = release
         self._can_fly = can_fly
         self._announce = announce
         self.action = Action.NONE
@@ -404,17 +412,24 @@ class FailsafeMachine:
     def _mode_fallback(self, conditions: Conditions, intended: Mode) -> Action:
         """The fallback of a mode that is no longer possible."""
         action, wanted = Action.NONE, intended
+        checks = self._release.checks_sticks if conditions.manual_control_lost else SticksCheck.NEVER
         if intended is Mode.OFFBOARD and conditions.offboard_signal_lost:
             action, wanted = self._offboard_loss()
-            if action < Action.HOLD and conditions.manual_control_lost:
-                action = link_loss_response(self._value("NAV_RCL_ACT"), Cause.GENERIC).action or Action.RETURN
             if action >= Action.HOLD:
                 return action  # it needs no sticks; `_possible` checks whether it is possible
+            if checks is not SticksCheck.NEVER:
+                action = self._without_sticks()
         if wanted in (Mode.POSCTL, Mode.POSITION_SLOW) and not self._can_fly(wanted):
             action, wanted = Action.FALLBACK_ALTITUDE, Mode.ALTCTL
         if wanted is Mode.ALTCTL and not self._can_fly(wanted):
             action, wanted = Action.FALLBACK_STABILIZED, Mode.STABILIZED
+        if checks is SticksCheck.ALWAYS and action in _STICK_ACTIONS:
+            action = self._without_sticks()
         return action if self._can_fly(wanted) else Action.RETURN
+
+    def _without_sticks(self) -> Action:
+        """NAV_RCL_ACT instead of a mode of sticks. NONE: OFFBOARD stays, with its last setpoint."""
+        return link_loss_response(self._value("NAV_RCL_ACT"), Cause.GENERIC).action
 
     def _offboard_loss(self) -> tuple[Action, Mode]:
         """COM_OBL_RC_ACT: 0 position, 1 altitude, 2 stabilized, 3 return, 4 land, 5 hold, 6 and 7 stop it."""

@@ -1,7 +1,7 @@
 """PX4's mode requirements and fallback without a valid horizontal position.
 
-A mode that needs a position is refused, and left if it is active: Position falls back to Altitude where a
-pilot has sticks, every other mode to Descend, because Return and Land need a position too. Descend is
+A mode that needs a position is refused, and left if it is active: Position falls back to Altitude (v1.18:
+only with a pilot's sticks), every other mode to Descend, as Return and Land need a position too. Descend is
 reported as LAND in HEARTBEAT, as by PX4: level, sinking with MPC_LAND_SPEED, drifting with the wind. OFFBOARD
 is left only if its setpoints need a position or a velocity; then they count as lost. When the position is
 back in the air, the intended mode is resumed; a vehicle that has descended to the ground stays there.
@@ -10,7 +10,7 @@ back in the air, the intended mode is resumed; a vehicle that has descended to t
 
 from __future__ import annotations
 
-from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
+from mavlink_sim.flight.position_control import NAN, NOTHING, Demand, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Land, Task
 from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.px4.modes import Mode
@@ -34,6 +34,36 @@ class Descend(Task):
         return TrajectorySetpoint(
             velocity=(NAN, NAN, speed), acceleration=(0.0, 0.0, NAN), yaw_rad=self._yaw_rad
         )
+
+
+class Sink(Task):
+    """A climb-rate mode without sticks: PX4's flight tasks need them, so it descends.
+
+    Flown on v1.16.2: 0.6 to 0.8 m/s to the ground.
+    """
+
+    def __init__(self, parameters: Parameters, yaw_rad: float) -> None:
+        self._descent = Descend(parameters, yaw_rad)
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        return self._descent.update(dt_s)
+
+
+class Drift(Task):
+    """A mode of tilt and thrust without sticks: the last of them stays (flown on v1.16.2, Stabilized)."""
+
+    def __init__(self, demand: Demand) -> None:
+        self.demand = Demand(demand.thrust_mps2, demand.roll_rad, demand.pitch_rad, 0.0)
+
+    def update(self, dt_s: float) -> TrajectorySetpoint:
+        return TrajectorySetpoint()
+
+
+def task_without_sticks(mode: Mode, airframe: Multirotor, parameters: Parameters, demand: Demand) -> Task:
+    """The task of a mode of sticks while there are none. `demand`: the last one."""
+    if mode in (Mode.POSCTL, Mode.POSITION_SLOW, Mode.ALTCTL):
+        return Sink(parameters, airframe.yaw_rad)
+    return Drift(demand)
 
 
 def needs_position(mode: Mode) -> bool:

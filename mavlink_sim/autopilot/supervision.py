@@ -23,6 +23,7 @@ from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.releases import Release
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text, event_identifier
 
 EMERGENCY = 0  # MAV_SEVERITY_EMERGENCY
@@ -111,14 +112,14 @@ class Supervision:
         pilot_attached: sticks are assumed to be present and centred, whatever COM_RC_IN_MODE is.
     """
 
-    def __init__(self, autopilot: SupervisedAutopilot, parameters: Parameters) -> None:
+    def __init__(self, autopilot: SupervisedAutopilot, parameters: Parameters, release: Release) -> None:
         self._autopilot = autopilot
         self._parameters = parameters
         self.manual_control = ManualControl(parameters)
         self.transmitter = Transmitter(parameters)
         self.battery = Battery(parameters)
         self.conditions = Conditions()
-        self.failsafes = FailsafeMachine(parameters, self._can_fly, autopilot.texts.append)
+        self.failsafes = FailsafeMachine(parameters, self._can_fly, autopilot.texts.append, release)
         self.channels_us: list[int] = []
         self.channels_s = -math.inf
         self.ground_station_seen_s = -math.inf

@@ -106,6 +106,8 @@ def battery_status(vehicle: ServiceContext) -> Any:
 
 def current_mode(vehicle: ServiceContext) -> Any:
     autopilot = vehicle.autopilot
+    if not vehicle.release.has_current_mode:
+        return None
     return dialect.MAVLink_current_mode_message(
         autopilot.mode.standard_mode, autopilot.mode.custom_mode, autopilot.intended_mode.custom_mode
     )

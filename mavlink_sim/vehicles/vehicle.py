@@ -227,6 +227,7 @@ class Vehicle:
             local_frame=self.local_frame,
             ready_after_s=self.ready_after_s,
             on_event=self._on_event,
+            release=self.release,
         )
         self.autopilot.position_valid = self.estimate.position_valid
         self.vision = VisionAiding(self.estimate, self.parameters)
@@ -326,6 +327,8 @@ class Vehicle:
         """Attach a link with the onboard link's rates, or others (`streams.GCS_RATES_HZ`)."""
         equipment = {name: rates[rates_hz is not None] for name, rates in EQUIPMENT_RATES_HZ.items()}
         rates = equipment | (ONBOARD_RATES_HZ if rates_hz is None else rates_hz)
+        if not self.release.has_current_mode:
+            rates.pop("CURRENT_MODE", None)
         # links start with different phases, so that they do not all send in the same millisecond
         link = self.links[name] = Link(
             name, self.system_id, Streams(rates, 0.0017 * len(self.links), self.stream_clock_rate)

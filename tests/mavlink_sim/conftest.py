@@ -265,7 +265,8 @@ class SimHarness:
     def offboard(self, setpoint: Any) -> None:
         """Switch to OFFBOARD with a stream of this setpoint."""
         self.fly(0.2, setpoint)
-        assert self.set_mode(6) == [0, 0]
+        twice = self.vehicle.release.acknowledges_modes_twice
+        assert self.set_mode(6) == [0] * (2 if twice else 1)
         self.fly(0.1, setpoint)
         assert self.mode == "OFFBOARD"
 

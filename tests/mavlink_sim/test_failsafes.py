@@ -9,6 +9,7 @@ from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.releases import NEWEST, release_named
 from mavlink_sim.wire.announcements import Text, event_identifier
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import CALIBRATION, SimHarness, velocity_setpoint
@@ -36,7 +37,7 @@ class Machine:
         self.announced: list[Text] = []
         self.impossible: set[Mode] = set()
         self.machine = FailsafeMachine(
-            parameters, lambda mode: mode not in self.impossible, self.announced.append
+            parameters, lambda mode: mode not in self.impossible, self.announced.append, release_named(NEWEST)
         )
         self.conditions = Conditions(
             manual_control_lost=False, ground_station_lost=False, offboard_signal_lost=False

@@ -156,6 +156,7 @@ def test_slow_vehicle_runs_at_given_pace(harness: SimHarness) -> None:
 @pytest.mark.streams("GPS_RAW_INT", "LOCAL_POSITION_NED", "ODOMETRY")
 def test_offboard_position_descends_without_gps_and_resumes(harness: SimHarness) -> None:
     harness.heartbeats = [("gcs", (245, 190), 6)]
+    harness.vehicle.parameters.set("COM_OBL_RC_ACT", 3)
     harness.take_off(20.0)
     setpoint = position_setpoint(0, 0, -20)
     harness.offboard(setpoint)
@@ -183,6 +184,32 @@ def test_offboard_position_descends_without_gps_and_resumes(harness: SimHarness)
     assert len(positions) == 1
     harness.until(lambda: harness.mode == "OFFBOARD", 2.0, setpoint)
     assert newest(harness, "ODOMETRY").reset_counter > 0
+
+
+@pytest.mark.parametrize(
+    ("release", "sticks", "mode", "sinks"),
+    [
+        ("1.14", False, "ALTCTL", True),
+        ("1.16", False, "ALTCTL", True),  # flown: 8.4 m to 0.9 m in 11 s
+        ("1.17", False, "ALTCTL", True),
+        ("1.18", False, "LAND", True),
+        ("1.16", True, "ALTCTL", False),
+        ("1.18", True, "ALTCTL", False),
+    ],
+)
+def test_gps_loss_in_offboard_without_sticks_sinks(
+    release: str, sticks: bool, mode: str, sinks: bool
+) -> None:
+    harness = SimHarness(px4=release)
+    harness.take_off(8.0)
+    harness.vehicle.autopilot.pilot_has_sticks = sticks
+    setpoint = velocity_setpoint(0, 0, 0)
+    harness.offboard(setpoint)
+    begin(harness, "gps_loss seed=1")
+    harness.until(lambda: harness.mode != "OFFBOARD", 6.0, setpoint)
+    assert harness.mode == mode
+    harness.fly(8.0, setpoint)
+    assert (harness.height_m < 4.0) is sinks
 
 
 def test_offboard_by_attitude_needs_no_position() -> None:

@@ -84,6 +84,7 @@ def test_blind_landing_stays_down_with_regained_position(harness: SimHarness, mo
     if mode == "TAKEOFF":
         assert harness.command(22, math.nan, 0, 0, math.nan, math.nan, math.nan, 489.4 + 40.0) == [0]
     elif mode == "OFFBOARD":
+        harness.vehicle.parameters.set("COM_OBL_RC_ACT", 3)
         harness.offboard(position_setpoint(0.0, 0.0, -4.0))
     elif mode != "HOLD":
         breach_the_fence(harness, RETURN_ACTION)

@@ -70,7 +70,7 @@ def test_autopilot_version_by_512_148_or_520__before_ack(ready: SimHarness, comm
     # MISSION_FLOAT, PARAM_FLOAT, MISSION_INT, COMMAND_INT, PARAM_ENCODE_BYTEWISE, FTP, SET_ATTITUDE_TARGET…
     assert version.capabilities == 59647
     assert version.capabilities & (1 << 5)  # FTP
-    assert version.flight_sw_version == 0x01110040
+    assert version.flight_sw_version == 0x011100FF
     assert (version.board_version, version.vendor_id, version.product_id) == (1, 0, 0)
     assert bytes(version.flight_custom_version) == bytes([0, 0, 0, 253, 175, 214, 222, 89])
     assert version.uid == 5283920058631409231

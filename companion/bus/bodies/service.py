@@ -25,6 +25,21 @@ class OtherCommanderBody(TypedDict):
     """whether it is in command"""
 
 
+class StatusSilenceBody(TypedDict):
+    """What the autopilot does in flight when our setpoints stop."""
+
+    effect: str
+    """return, land, hold, pilot, sink, drift, fall, fly_on or unknown"""
+    mode: str
+    """the flight mode then; unknown: none is entered, or it is not known"""
+    after_s: float | None
+    """from the last setpoint; null: not known, or never"""
+    warning: bool
+    """it endangers the vehicle, takes longer than 2 s, or is not known"""
+    text: str
+    """one sentence"""
+
+
 class StatusVehicleBody(TypedDict):
     """The link to the vehicle."""
 
@@ -34,6 +49,8 @@ class StatusVehicleBody(TypedDict):
     """a heartbeat was received within 3 s"""
     autopilot: str | None
     """PX4 or ArduPilot; null until known"""
+    firmware: str | None
+    """its version, for example 1.16.2; null until known"""
     driver: str
     """MAVLink library: mavsdk or pymavlink"""
     mode: str
@@ -44,6 +61,10 @@ class StatusVehicleBody(TypedDict):
     """MAV_STATE_CRITICAL or EMERGENCY"""
     not_flown: str | None
     """why it gets no flight commands, by its type; null: it gets them"""
+    sticks: str | None
+    """what a pilot's sticks do while our setpoints are flown; null until known"""
+    silence: StatusSilenceBody
+    """without setpoints"""
     missing_streams: list[str]
     """required messages that arrive at less than half their rate"""
     status_texts: list[str]
@@ -91,6 +112,12 @@ class StatusLimitsBody(TypedDict):
     """horizontally"""
     max_altitude_m: float
     """above home"""
+    max_horizontal_speed_mps: float
+    """horizontal speed, after the autopilot's own limit"""
+    max_climb_mps: float
+    """upwards, after the autopilot's own limit"""
+    max_descend_mps: float
+    """downwards, after the autopilot's own limit"""
     fence_include: Corners
     """corners north, east; empty: no fence"""
     fence_exclude: list[Corners]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from companion.geometry.fence import Fence
 from companion.guidance.formation.neighbours import Neighbour
@@ -25,6 +25,7 @@ from companion.guidance.formation.separation import (
     constraints_at,
     level_constraints,
 )
+from companion.vehicle.autopilot_parameters import AutopilotParameters
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState, with_fields
 from vision.attitude import wrap_angle
@@ -49,6 +50,11 @@ FENCE_DELAY_S = 0.4
 # Maximum speed per metre left: critically damped for a velocity time constant of 0.3 s.
 FENCE_GAIN_PER_S = 0.8
 NO_FENCE = Fence()
+_PX4_LIMITS = {
+    "max_horizontal_speed_mps": "MPC_XY_VEL_MAX",
+    "max_climb_mps": "MPC_Z_VEL_MAX_UP",
+    "max_descend_mps": "MPC_Z_VEL_MAX_DN",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +96,24 @@ class Limits:
                 f"min_altitude_m must be below max_altitude_m, got {self.min_altitude_m} "
                 f"and {self.max_altitude_m}"
             )
+
+
+def within_autopilot(limits: Limits, read: AutopilotParameters) -> tuple[Limits, str]:
+    """The limits as far as the autopilot flies our velocities, and what it reduces, in words; empty: nothing.
+
+    PX4 limits them by its own parameters (v1.14 to v1.18). Copter's WPNAV_SPEED and WP_SPD do not limit
+    velocities in GUIDED (4.7, from source).
+    """
+    changes: dict[str, Any] = {}
+    words = []
+    for field, name in _PX4_LIMITS.items():
+        value = read.get(name)
+        if value is not None and 0.0 < value < getattr(limits, field):
+            changes[field] = value
+            words.append(f"{name} {value:g} m/s is below guidance.{field} = {getattr(limits, field):g}")
+    if not changes:
+        return limits, ""
+    return replace(limits, **changes), f"speed limited by the autopilot: {', '.join(words)}"
 
 
 class Limited(NamedTuple):

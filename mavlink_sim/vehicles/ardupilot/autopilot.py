@@ -30,6 +30,7 @@ from mavlink_sim.px4.modes import (
     SystemState,
 )
 from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.releases import Release
 from mavlink_sim.vehicles.ardupilot.guided import Guided
 from mavlink_sim.vehicles.ardupilot.landing import Land, ReturnToLaunch
 from mavlink_sim.vehicles.ardupilot.modes import (
@@ -117,9 +118,15 @@ class CopterAutopilot(Autopilot):
         local_frame: LocalFrame,
         ready_after_s: float,
         on_event: Callable[[str], None],
+        release: Release,
     ) -> None:
         super().__init__(
-            airframe, parameters, local_frame=local_frame, ready_after_s=ready_after_s, on_event=on_event
+            airframe,
+            parameters,
+            local_frame=local_frame,
+            ready_after_s=ready_after_s,
+            on_event=on_event,
+            release=release,
         )
         self.mode = self.intended_mode = CopterMode.STABILIZE
         self.mode_changes = 0

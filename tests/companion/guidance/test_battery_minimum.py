@@ -156,7 +156,8 @@ def test_low_battery_while_engaging_starts_the_return() -> None:
 def test_both_battery_messages_set_the_stamp() -> None:
     state = apply_message(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
     assert (state.battery_fraction, state.battery_ns) == (0.4, 5)
-    fields = {"onboard_control_sensors_health": 0, "battery_remaining": 39}
+    sensors = {"onboard_control_sensors_present": 0, "onboard_control_sensors_health": 0}
+    fields = {**sensors, "battery_remaining": 39}
     state = apply_message(state, "SYS_STATUS", fields, 9)
     assert (state.battery_fraction, state.battery_ns) == (0.39, 9)
     unknown = apply_message(state, "BATTERY_STATUS", {"id": 0, "battery_remaining": -1}, 20)

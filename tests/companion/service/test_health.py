@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, cast
 
 import pytest
@@ -16,6 +18,7 @@ from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings.vehicle import VehicleSection
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vehicle_type import PX4, VtolState
@@ -24,12 +27,24 @@ from companion.vehicle.vehicle_type import PX4, VtolState
 class FakeDriver:
     """An autopilot with some parameters."""
 
-    def __init__(self, autopilot: str | None, parameters: dict[str, float]) -> None:
+    library = "fake"
+    own_address = (1, 191)
+
+    def __init__(
+        self, autopilot: str | None, parameters: dict[str, float], version: FirmwareVersion | None
+    ) -> None:
         self.state = VehicleState(autopilot=autopilot)
         self.link_count = 1
-        self._parameters = parameters
+        self.on_read: Callable[[], object] = lambda: None
+        self._parameters, self._version = parameters, version
+
+    async def firmware_version(self) -> FirmwareVersion:
+        if self._version is None:
+            raise CommandRefusedError("firmware version: no AUTOPILOT_VERSION")
+        return self._version
 
     async def get_parameter(self, name: str) -> float:
+        self.on_read()
         if name not in self._parameters:
             raise CommandRefusedError(f"parameter {name}: no answer")
         return self._parameters[name]
@@ -38,8 +53,12 @@ class FakeDriver:
         pass
 
 
+def guidance() -> Guidance:
+    return Guidance(guidance_options(plain_settings(), (1, 191)))
+
+
 def health_of(
-    autopilot: str | None, parameters: dict[str, float]
+    autopilot: str | None, parameters: dict[str, float], version: FirmwareVersion | None
 ) -> tuple[Health, FakeDriver, InputAssembler, list[tuple[str, str]]]:
     """The check, its driver, what guidance gets, and the events."""
     events: list[tuple[str, str]] = []
@@ -49,79 +68,147 @@ def health_of(
 
     settings = plain_settings()
     inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], on_event)
-    driver = FakeDriver(autopilot, parameters)
+    driver = FakeDriver(autopilot, parameters, version)
     others = OtherCommanders(VehicleSection(), "here", 0, on_event)
     health = Health(cast(Driver, driver), inputs, (), SystemdNotifier({}), others, on_event)
     return health, driver, inputs, events
 
 
 async def check(
-    autopilot: str | None, parameters: dict[str, float]
+    autopilot: str | None, parameters: dict[str, float], version: FirmwareVersion | None
 ) -> tuple[InputAssembler, list[tuple[str, str]]]:
     """Run the check; returns what guidance gets, and the events."""
-    health, _, inputs, events = health_of(autopilot, parameters)
+    health, _, inputs, events = health_of(autopilot, parameters, version)
     await health.check()
     return inputs, events
 
 
-@pytest.mark.parametrize(
-    ("guided_timeout_s", "warned"),
-    [(3.0, ["GUID_TIMEOUT is 3 s"]), (1.0, []), (None, ["parameter GUID_TIMEOUT: no answer: check"])],
-)
-async def test_long_guided_timeout_is_warned(guided_timeout_s: float | None, warned: list[str]) -> None:
-    parameters = {} if guided_timeout_s is None else {"GUID_TIMEOUT": guided_timeout_s}
-    inputs, events = await check("ArduPilot", parameters)
-    assert [level for level, _ in events] == ["warning"] * len(warned)
-    assert all(text.startswith(begin) for (_, text), begin in zip(events, warned, strict=True))
-    assert inputs.altitude_acceptance_m is None
+PX4_VALUES = {
+    "COM_OF_LOSS_T": 1.0,
+    "COM_OBL_RC_ACT": 0.0,
+    "COM_RC_IN_MODE": 3.0,
+    "COM_RC_OVERRIDE": 1.0,
+    "NAV_RCL_ACT": 2.0,
+    "NAV_MC_ALT_RAD": 0.8,
+    "MPC_XY_VEL_MAX": 12.0,
+    "MPC_Z_VEL_MAX_UP": 3.0,
+    "MPC_Z_VEL_MAX_DN": 1.5,
+}
+COPTER_VALUES = {
+    "GUID_TIMEOUT": 1.0,
+    "GUID_OPTIONS": 0.0,
+    "FS_GCS_ENABLE": 0.0,
+    "FS_GCS_TIMEOUT": 5.0,
+    "MAV_GCS_SYSID": 255.0,
+}
+
+
+async def test_everything_is_read_once_for_guidance() -> None:
+    inputs, events = await check("PX4", PX4_VALUES, FirmwareVersion(1, 18))
+    assert inputs.parameters == AutopilotParameters(
+        "PX4", FirmwareVersion(1, 18), 1, tuple(PX4_VALUES.items())
+    )
+    assert "warning" not in [level for level, _ in events]
+
+
+async def test_what_cannot_be_read_is_reported_by_name() -> None:
+    inputs, events = await check("PX4", {"COM_OF_LOSS_T": 1.0}, None)
+    warned = [text for level, text in events if level == "warning"]
+    assert len(warned) == len(PX4_VALUES)  # all but one, and the version
+    assert sum(name in text for name in PX4_VALUES for text in warned) == len(PX4_VALUES) - 1
+    assert inputs.parameters.get("NAV_MC_ALT_RAD") is None
+
+
+def said(events: list[tuple[str, str]], *, about: str) -> list[tuple[str, str]]:
+    return [(level, text) for level, text in events if about in text]
 
 
 @pytest.mark.parametrize(
-    ("parameters", "read", "warned"),
-    [({"NAV_MC_ALT_RAD": 1.6}, 1.6, 0), ({}, None, 1)],
+    ("autopilot", "version", "values", "level", "words"),
+    [
+        ("PX4", FirmwareVersion(1, 16, 2), {}, "warning", "1.16.2 changes to position mode and sinks"),
+        ("PX4", FirmwareVersion(1, 16, 2), {"COM_OBL_RC_ACT": 5.0}, "info", "holds its position after 1.1 s"),
+        ("PX4", FirmwareVersion(1, 18), {}, "info", "1.18.0 returns home after 1.1 s"),
+        ("PX4", FirmwareVersion(1, 18), {"COM_OF_LOSS_T": 5.0}, "warning", "after 5.1 s"),
+        ("PX4", None, {}, "warning", "not known"),
+        ("ArduPilot", FirmwareVersion(4, 7), {}, "info", "GUID_TIMEOUT is 1 s"),
+        ("ArduPilot", FirmwareVersion(4, 7), {"GUID_TIMEOUT": 3.0}, "warning", "GUID_TIMEOUT is 3 s"),
+    ],
 )
-async def test_guidance_gets_px4s_altitude_acceptance(
-    parameters: dict[str, float], read: float | None, warned: int
+async def test_effect_of_silence_is_reported_at_connect(
+    autopilot: str, version: FirmwareVersion | None, values: dict[str, float], level: str, words: str
 ) -> None:
-    inputs, events = await check("PX4", parameters)
-    assert inputs.altitude_acceptance_m == read
-    assert [level for level, _ in events] == ["warning"] * warned
-    for _, text in events:
-        assert text.startswith("parameter NAV_MC_ALT_RAD: ")
-        assert "no answer: 0.8 m " in text
+    defaults = PX4_VALUES if autopilot == "PX4" else COPTER_VALUES
+    health, _, _, events = health_of(autopilot, {**defaults, **values}, version)
+    health.after_step(0, guidance())
+    await health.check()
+    health.after_step(1, guidance())
+    health.after_step(2, guidance())
+    (line,) = said(events, about="without setpoints")
+    assert line[0] == level
+    assert words in line[1]
+
+
+async def test_effect_of_silence_is_reported_again_when_sticks_come() -> None:
+    health, driver, _, events = health_of("PX4", PX4_VALUES, FirmwareVersion(1, 16))
+    health.after_step(0, guidance())
+    await health.check()
+    health.after_step(1, guidance())
+    driver.state = replace(driver.state, sticks_present=True)
+    health.after_step(2, guidance())
+    assert [level for level, _ in said(events, about="without setpoints")] == ["warning", "info"]
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "values", "words"),
+    [
+        ("PX4", {}, "do nothing in OFFBOARD (COM_RC_OVERRIDE 1)"),
+        ("PX4", {"COM_RC_OVERRIDE": 3.0}, "moving the sticks takes over"),
+        ("PX4", {"COM_RC_IN_MODE": 4.0}, "ignores all sticks"),
+        ("ArduPilot", {}, "do nothing in GUIDED, the yaw stick turns"),
+        ("ArduPilot", {"GUID_OPTIONS": 4.0}, "do nothing in GUIDED, the yaw stick too"),
+    ],
+)
+async def test_effect_of_sticks_is_reported_at_connect(
+    autopilot: str, values: dict[str, float], words: str
+) -> None:
+    defaults = PX4_VALUES if autopilot == "PX4" else COPTER_VALUES
+    _, events = await check(autopilot, {**defaults, **values}, FirmwareVersion(4, 7))
+    (line,) = said(events, about="sticks")
+    assert line[0] == "info"
+    assert words in line[1]
 
 
 async def test_parameter_changed_between_links_is_read_again() -> None:
-    parameters = {"NAV_MC_ALT_RAD": 1.6}
-    health, driver, inputs, events = health_of("PX4", parameters)
-    guidance = Guidance(guidance_options(plain_settings(), (1, 191)))
+    values = dict(PX4_VALUES)
+    health, driver, inputs, events = health_of("PX4", values, FirmwareVersion(1, 18))
 
     async def step_and_read() -> None:
-        health.after_step(0, guidance)
-        assert inputs.altitude_acceptance_m is None  # nothing stale is kept until the answer
+        health.after_step(0, guidance())
+        assert inputs.parameters is NOTHING_READ  # nothing stale is kept until the answer
         for _ in range(5):
             await asyncio.sleep(0)
 
     running = asyncio.create_task(health.run())
     await step_and_read()
-    assert inputs.altitude_acceptance_m == 1.6
-    parameters["NAV_MC_ALT_RAD"] = 0.5
-    health.after_step(0, guidance)
-    assert inputs.altitude_acceptance_m == 1.6  # the link has not changed
+    assert inputs.parameters.altitude_acceptance_m == 0.8
+    values["NAV_MC_ALT_RAD"] = 0.5
+    health.after_step(0, guidance())
+    assert inputs.parameters.altitude_acceptance_m == 0.8  # the link has not changed
     driver.link_count += 1
     await step_and_read()
-    assert inputs.altitude_acceptance_m == 0.5
-    parameters.clear()
+    health.after_step(0, guidance())
+    assert inputs.parameters.altitude_acceptance_m == 0.5
+    assert len(said(events, about="without setpoints")) == 2  # of each connection
+    del values["NAV_MC_ALT_RAD"]
     driver.link_count += 1
     await step_and_read()
-    assert inputs.altitude_acceptance_m is None
-    assert [level for level, _ in events] == ["warning"]
+    assert inputs.parameters.altitude_acceptance_m is None
     running.cancel()
 
 
 def test_vehicle_that_is_not_flown_is_reported_once_per_change() -> None:
-    health, driver, _, events = health_of("PX4", {})
-    guidance = Guidance(guidance_options(plain_settings(), (1, 191)))
+    health, driver, _, events = health_of("PX4", {}, None)
 
     def step(mav_type: int | None, vtol_state: VtolState | None) -> list[str]:
         autopilot = None if mav_type is None else PX4
@@ -129,8 +216,8 @@ def test_vehicle_that_is_not_flown_is_reported_once_per_change() -> None:
             autopilot="PX4", mav_type=mav_type, mav_autopilot=autopilot, vtol_state=vtol_state
         )
         events.clear()
-        health.after_step(0, guidance)
-        health.after_step(0, guidance)
+        health.after_step(0, guidance())
+        health.after_step(0, guidance())
         return [level for level, _ in events]
 
     tiltrotor, fixed_wing = 21, 1
@@ -141,5 +228,12 @@ def test_vehicle_that_is_not_flown_is_reported_once_per_change() -> None:
     assert step(fixed_wing, VtolState.UNDEFINED) == ["error"]
 
 
+async def test_answers_of_an_earlier_link_are_not_used() -> None:
+    health, driver, inputs, _ = health_of("PX4", PX4_VALUES, FirmwareVersion(1, 18))
+    driver.on_read = lambda: setattr(driver, "link_count", 2)
+    await health.check()
+    assert inputs.parameters is NOTHING_READ
+
+
 async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:
-    assert (await check(None, {}))[1] == []
+    assert (await check(None, {}, None))[1] == []

@@ -11,6 +11,7 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.state import FlightMode, HeightSource, LandedState, VehicleState
@@ -66,6 +67,7 @@ async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKin
             assert state.home_altitude_amsl_m is not None
             assert abs(state.altitude_amsl_m - state.home_altitude_amsl_m) < 1.0
 
+            assert await driver.firmware_version() == FirmwareVersion(1, 17)
             assert await driver.get_parameter("COM_OF_LOSS_T") == 1.0
             await driver.set_parameter("COM_OF_LOSS_T", 0.75)
             await driver.set_parameter("COM_OBL_RC_ACT", 4)

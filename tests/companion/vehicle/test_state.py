@@ -60,14 +60,6 @@ def test_fresh_needs_position_and_attitude(late: str) -> None:
         assert not VehicleState(**stamps, **known | {missing: None}).position_fresh(now_ns)
 
 
-def test_without_setpoints_names_the_autopilots_failsafe() -> None:
-    assert "COM_OBL_RC_ACT" in VehicleState(autopilot="PX4").without_setpoints
-    of_ardupilot = VehicleState(autopilot="ArduPilot").without_setpoints
-    assert "GUID_TIMEOUT" in of_ardupilot
-    assert "COM_" not in of_ardupilot
-    assert "COM_" not in VehicleState().without_setpoints
-
-
 CHANGES = {
     "battery_fraction": st.floats(0, 1),
     "armed": st.booleans(),

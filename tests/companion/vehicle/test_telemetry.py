@@ -103,7 +103,11 @@ def test_home_altitude_without_local_position() -> None:
 def test_sys_status_sets_readiness_and_battery(
     health: int, remaining: int, ready: bool, fraction: float | None
 ) -> None:
-    fields = {"onboard_control_sensors_health": health, "battery_remaining": remaining}
+    fields = {
+        "onboard_control_sensors_present": 0,
+        "onboard_control_sensors_health": health,
+        "battery_remaining": remaining,
+    }
     state = apply_message(VehicleState(), "SYS_STATUS", fields, 5)
     assert (state.ready_to_arm, state.battery_fraction) == (ready, fraction)
 
