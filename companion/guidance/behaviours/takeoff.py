@@ -1,9 +1,15 @@
-"""Take off with the autopilot's own take-off mode, and finish the climb if it stops short."""
+"""Take off with the autopilot's own take-off mode, and finish the climb if it stops short.
+
+PX4 ends its take-off as soon as it is within its acceptance radius (NAV_MC_ALT_RAD) of the height. Of a low
+one that is near the ground, and by the drift of the height on it (v1.16.2 and v1.18.0-beta1). So a low
+take-off arms in HOLD and climbs in OFFBOARD from the ground; there every other mode is a pilot's.
+"""
 
 from __future__ import annotations
 
 from typing import Annotated
 
+from companion.guidance.authority import DEFAULT_ACCEPTANCE_M
 from companion.guidance.behaviour import (
     Behaviour,
     BehaviourContext,
@@ -28,6 +34,9 @@ THERE_S = 0.5
 BASE_TIMEOUT_S = 25.0
 SLOWEST_CLIMB_MPS = 0.5
 CLIMB_MPS = 1.0
+# PX4's own take-off is used from this far above its acceptance radius: its height may drift by 0.5 m, and it
+# still climbs more than 1 m.
+LOW_MARGIN_M = 1.5
 
 
 @behaviour("takeoff", "arm, climb to a height above home and stay there")
@@ -52,6 +61,7 @@ class TakeoffBehaviour(Behaviour):
         self._yaw_rad: float | None = None
         self._controller = PositionController()
         self._altitude_now_m = 0.0
+        self._low = False
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
@@ -73,6 +83,9 @@ class TakeoffBehaviour(Behaviour):
         self._until_ns = context.now_ns + limit_s * 1e9
         self._still_since_ns = self._there_since_ns = self._top = None
         self._controller = PositionController()
+        acceptance_m = context.parameters.altitude_acceptance_m
+        reach_m = (DEFAULT_ACCEPTANCE_M if acceptance_m is None else acceptance_m) + LOW_MARGIN_M
+        self._low = context.state.autopilot == "PX4" and self._altitude_m < reach_m
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns, state = context.now_ns, context.state
@@ -90,7 +103,7 @@ class TakeoffBehaviour(Behaviour):
             return Outcome(
                 True,
                 f"took off, {self._altitude_now_m:.1f} m above home",
-                self._top or self._above(state, missing_m),
+                self._above(state, missing_m, self._top),
             )
         if now_ns > self._until_ns:
             return Outcome(
@@ -98,17 +111,25 @@ class TakeoffBehaviour(Behaviour):
             )
         if self._top is None:
             still_s = 0.0 if self._still_since_ns is None else (now_ns - self._still_since_ns) / 1e9
-            if there or still_s < SETTLE_S or state.position_fault(now_ns) is not None:
+            if self._low:
+                begins = state.armed and state.mode in (FlightMode.HOLD, FlightMode.OFFBOARD)
+            else:
+                begins = not there and still_s >= SETTLE_S
+            if not begins or state.position_fault(now_ns) is not None:
+                if self._low:
+                    return ModeRequest(FlightMode.HOLD, arm=True)
                 return ModeRequest(FlightMode.TAKEOFF, self._altitude_m, arm=True)
-            self._top, self._yaw_rad = self._above(state, missing_m), state.yaw_rad
+            self._yaw_rad = state.yaw_rad
+        self._top = self._above(state, missing_m, self._top)
         velocity = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
 
     @staticmethod
-    def _above(state: VehicleState, missing_m: float) -> Vector3:
-        """The point at the wanted height above the vehicle's position, local NED."""
-        north, east, down = state.position_ned_m or (0.0, 0.0, 0.0)
-        return (north, east, down - missing_m)
+    def _above(state: VehicleState, missing_m: float, top: Vector3 | None) -> Vector3:
+        """The point at the wanted height above home, which arming moves, and above `top` or the vehicle."""
+        here = state.position_ned_m or (0.0, 0.0, 0.0)
+        north, east, _ = top or here
+        return (north, east, here[2] - missing_m)
 
     @property
     def status(self) -> str:
