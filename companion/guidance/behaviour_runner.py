@@ -22,7 +22,7 @@ from companion.guidance.mode_control import ModeControl, Phase
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, Vector3
+from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from companion.vehicle.streamer import StreamState
 
 logger = logging.getLogger(__name__)
@@ -68,6 +68,8 @@ class BehaviourRunner:
         self.gimbal_user = ""
         self.approached: Approached | None = None
         self._landing = False
+        self._taken_from: FlightMode | None = None
+        self._took_over = ""
         self._setpoints = setpoints
         self._modes = modes
         self._battery = BatteryMonitor(battery)
@@ -81,6 +83,7 @@ class BehaviourRunner:
     def begin_command(self, behaviour: Behaviour, command: CommandInput, context: BehaviourContext) -> None:
         """Replace the active behaviour by a command's."""
         self.end(Outcome(False, f"replaced by {behaviour.name}"))
+        self._note_mode(context.state)
         self._modes.prepare(context.state)
         self._battery.reset()
         self._begin(behaviour, command)
@@ -120,7 +123,7 @@ class BehaviourRunner:
         if command is None or not command.endless or self._modes.phase is not Phase.OFFBOARD:
             return
         if inputs.state.mode is FlightMode.OFFBOARD and inputs.stream.state is StreamState.FRESH:
-            self._out.result(command.identifier, Outcome(True, "in progress"))
+            self._out.result(command.identifier, self._with_takeover(Outcome(True, "in progress")))
             self._command = None
 
     def end_after_standstill(self, why: str) -> None:
@@ -170,7 +173,8 @@ class BehaviourRunner:
             except Exception:
                 logger.exception("%s failed to deactivate", behaviour.name)
         if command is not None:
-            self._out.result(command.identifier, outcome)
+            self._out.result(command.identifier, self._with_takeover(outcome))
+        self._took_over = ""
         if after_battery:
             # No command waits for its result: log how it ended.
             self._battery_event(behaviour, f"{behaviour.name} after low battery: {outcome.reason}")
@@ -287,13 +291,38 @@ class BehaviourRunner:
             self._setpoints.brake(context)
         return False
 
+    def _note_mode(self, state: VehicleState) -> None:
+        """Note the mode of an armed vehicle that somebody else flies, before we are in command."""
+        if self._modes.phase is not Phase.IDLE:
+            return
+        flying = state.armed and state.landed is not LandedState.ON_GROUND
+        self._taken_from = state.mode if flying and state.mode is not FlightMode.HOLD else None
+
+    def _report_takeover(self, behaviour: Behaviour) -> None:
+        """Report from which mode a command took over, once the vehicle has left it."""
+        before, self._taken_from = self._taken_from, None
+        if before is not None:
+            self._took_over = f"took over from {before.value.replace('_', ' ')} mode"
+            words = f"{behaviour.name} {self._took_over}"
+            self._out.event(EventKind.NOTED, behaviour.name, words, warning=True)
+
+    def _with_takeover(self, outcome: Outcome) -> Outcome:
+        """A command's outcome, with the mode from which it took over."""
+        if not self._took_over:
+            return outcome
+        return replace(outcome, reason=f"{outcome.reason}; {self._took_over}")
+
     def _take_answer(self, answer: Answer, context: BehaviourContext) -> None:
         """Handle the answer to the pending request."""
         engaging = self._modes.phase is Phase.ENGAGING
         if answer.taken_over and answer.refused is not None:
             # Where that change no longer shows, our message has arrived after it; the driver undoes that.
             self._lose(answer.refused)
-        elif (why := self._modes.take_answer(answer, context.now_ns)) is not None:
+            return
+        why = self._modes.take_answer(answer, context.now_ns)
+        if self._modes.phase in (Phase.OFFBOARD, Phase.DELEGATED) and self.behaviour is not None:
+            self._report_takeover(self.behaviour)
+        if why is not None:
             self._request_failed(why, context)
         elif engaging and self._modes.phase is Phase.OFFBOARD:
             self._stepped_ns = None

@@ -31,7 +31,7 @@ AUTOPILOT_MODES = frozenset(
 )
 _COMMAND = re.compile(r"command: (?P<text>.+?)(?: \(\d+ before it not logged\))?")
 _LOST = "command lost: "
-_IN_PROGRESS = ": in progress"
+_IN_PROGRESS = re.compile(r"(?P<text>.+): in progress(; took over from .+)?")
 _KEPT_SENT = 50
 
 
@@ -82,9 +82,8 @@ class CommandEvents:
             self._begun(found["text"])
         elif text.startswith(_LOST):
             self.lost, self.active = text.removeprefix(_LOST), None
-        elif text.endswith(_IN_PROGRESS):
-            command = text.removesuffix(_IN_PROGRESS)
-            self.active = command if command in self._sent else None
+        elif (found := _IN_PROGRESS.fullmatch(text)) is not None:
+            self.active = found["text"] if found["text"] in self._sent else None
         elif self.active is not None and self._ends(self.active, level, text):
             self.active = None
 

@@ -41,7 +41,7 @@ export function onReply(answer) {
 }
 
 function outcome({ success, reason }) {
-  if (success && reason === "in progress") return `accepted, ${reason}`; // an endless command
+  if (success && reason.startsWith("in progress")) return `accepted, ${reason}`; // an endless command
   return `${success ? "done" : "failed"}: ${reason}`;
 }
 

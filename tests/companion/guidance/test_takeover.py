@@ -1,0 +1,75 @@
+"""A command that takes the vehicle from a pilot or from a mission says so, in its event and in its reply."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight
+from companion.guidance.interface import EventKind
+from companion.vehicle.state import FlightMode
+from mavlink_sim.px4.modes import Mode
+
+
+def flown_by(mode: Mode) -> LockstepFlight:
+    """A vehicle in the air in a mode that somebody else has chosen."""
+    flight = LockstepFlight.airborne(seed=4)
+    flight.vehicle.vehicle.autopilot.pilot_takes_over(mode)
+    assert flight.run_until(lambda: flight.state.mode.value == MODES[mode], 3.0)
+    return flight
+
+
+MODES = {Mode.POSCTL: "position", Mode.ALTCTL: "altitude", Mode.RTL: "return", Mode.HOLD: "hold"}
+
+
+def takeovers(flight: LockstepFlight) -> list[str]:
+    return [event.message for event in flight.events if event.kind is EventKind.NOTED]
+
+
+@pytest.mark.parametrize("mode", [Mode.POSCTL, Mode.ALTCTL, Mode.RTL])
+def test_command_says_from_which_mode_it_took_over(mode: Mode) -> None:
+    flight = flown_by(mode)
+    outcome = flight.fly("goto north=3 east=0", 40.0).outcome
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert outcome.reason.endswith(f"; took over from {MODES[mode]} mode")
+    assert takeovers(flight) == [f"goto took over from {MODES[mode]} mode"]
+
+
+def test_endless_command_and_autopilot_mode_say_it_too() -> None:
+    flight = flown_by(Mode.POSCTL)
+    identifier = flight.command("hold")
+    assert flight.run_until(lambda: flight.outcome(identifier), 5.0)
+    outcome = flight.outcome(identifier)
+    assert outcome is not None
+    assert outcome.reason == "in progress; took over from position mode"
+    flight = flown_by(Mode.POSCTL)
+    outcome = flight.fly("stop", 20.0).outcome
+    assert outcome is not None
+    assert outcome.success
+    assert outcome.reason.endswith("; took over from position mode")
+
+
+def test_only_the_first_command_after_the_pilot_says_it() -> None:
+    flight = flown_by(Mode.POSCTL)
+    assert flight.fly("goto north=3 east=0", 40.0).outcome is not None
+    outcome = flight.fly("goto north=0 east=0", 40.0).outcome
+    assert outcome is not None
+    assert "took over" not in outcome.reason
+    assert len(takeovers(flight)) == 1
+
+
+def test_nobody_is_displaced_in_hold_or_on_the_ground() -> None:
+    flight = LockstepFlight.airborne(seed=4)
+    outcome = flight.fly("goto north=3 east=0", 40.0).outcome
+    assert outcome is not None
+    assert "took over" not in outcome.reason
+    assert takeovers(flight) == []
+
+
+def test_refused_command_has_taken_nothing_over() -> None:
+    flight = flown_by(Mode.POSCTL)
+    outcome = flight.fly("goto north=3000 east=0", 5.0).outcome
+    assert outcome is not None
+    assert not outcome.success
+    assert "took over" not in outcome.reason
+    assert flight.state.mode is FlightMode.POSITION
