@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 
 from companion.guidance.limits.setpoint_monitor import SetpointMonitor
+from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report, words_of
 from companion.vehicle.setpoint import Setpoint
@@ -22,7 +23,7 @@ SHOW_DELAY_S = 2.0
 # PX4 ends a take-off inside NAV_MC_ALT_RAD, 0.8 m by default; the two height estimates differ by some more. A
 # hold further below the wanted height was requested by a pilot. PX4 allows up to 200 m: above the largest
 # value here it is no sign of how a take-off ended.
-DEFAULT_ACCEPTANCE_M, LARGEST_ACCEPTANCE_M, HEIGHT_MARGIN_M = 0.8, 2.0, 0.5
+LARGEST_ACCEPTANCE_M, HEIGHT_MARGIN_M = 2.0, 0.5
 # The autopilot reports a failsafe within this time of its change of mode.
 REPORT_WINDOW_S = 1.0
 # Of a vehicle that may have landed.

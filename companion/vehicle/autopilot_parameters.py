@@ -12,6 +12,8 @@ from dataclasses import dataclass
 RELEASE = 255  # FIRMWARE_VERSION_TYPE_OFFICIAL
 RELEASE_CANDIDATE = 192  # FIRMWARE_VERSION_TYPE_RC; below: development, alpha and beta versions
 _KINDS = {0: "dev", 64: "alpha", 128: "beta", RELEASE_CANDIDATE: "rc"}
+# PX4's default of NAV_MC_ALT_RAD, where it could not be read.
+DEFAULT_ACCEPTANCE_M = 0.8
 # COM_RC_IN_MODE: PX4 ignores all stick input.
 STICKS_DISABLED = 4
 _OFFBOARD_OVERRIDE = 2  # bit of COM_RC_OVERRIDE

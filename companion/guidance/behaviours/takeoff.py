@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from companion.guidance.authority import DEFAULT_ACCEPTANCE_M
 from companion.guidance.behaviour import (
     Behaviour,
     BehaviourContext,
@@ -20,6 +19,7 @@ from companion.guidance.behaviour import (
 )
 from companion.guidance.command import BuildContext, Command, Number, behaviour
 from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
+from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 

@@ -174,6 +174,17 @@ def test_pilots_hold_ends_a_low_takeoff_at_any_height(acceptance_m: float | None
         assert flight.state.mode is FlightMode.HOLD
 
 
+def test_low_takeoff_without_offboard_is_disarmed_on_the_ground() -> None:
+    flight = on_ground()
+    flight.vehicle.vehicle.faults.begin("refuse_mode OFFBOARD")
+    outcome = flight.fly("takeoff 1.5", 30.0).outcome
+    assert outcome is not None
+    assert not outcome.success
+    assert "offboard" in outcome.reason
+    assert flight.run_until(lambda: not flight.state.armed, 3.0)
+    assert flight.state.landed is LandedState.ON_GROUND
+
+
 @pytest.mark.parametrize("up_m", [pytest.param(0.73, marks=pytest.mark.slow), -0.73])
 def test_takeoff_counts_from_home_as_moved_by_arming(up_m: float) -> None:
     flight = on_ground()
