@@ -225,7 +225,7 @@ def test_a_long_guid_timeout_is_warned_of(
     else:
         link.after(WATCHED_S)
         service.last_lines()
-        assert not [line for line in service.lines if "GUID_TIMEOUT" in line]
+        assert not [line for line in service.lines if "set GUID_TIMEOUT" in line]
 
 
 def test_points_beyond_the_limits_are_refused(flight: Flight) -> None:

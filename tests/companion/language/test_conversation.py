@@ -451,6 +451,8 @@ LOST = ("warning", "command lost: the pilot took over: hold mode")
         ),
         ((ORBIT, GOTO), [*ACTIVE, ("info", f"command: {GOTO}"), ("info", f"{GOTO}: arrived")], False, None),
         ((ORBIT, "stop"), [*ACTIVE, ("info", "command: stop"), ("info", "stop: stopped")], False, None),
+        ((ORBIT,), [("info", f"{ORBIT}: in progress; took over from position mode")], False, ORBIT),
+        ((), [("info", f"{ORBIT}: in progress; took over from position mode")], False, None),
     ],
 )
 def test_events_say_who_commands(

@@ -1,0 +1,25 @@
+"""A command's reply for people."""
+
+from __future__ import annotations
+
+import pytest
+
+from companion.operator.reply_text import reply_text
+
+
+@pytest.mark.parametrize(
+    ("success", "reason", "text"),
+    [
+        (True, "arrived", "done: arrived"),
+        (False, "no position", "failed: no position"),
+        (True, "in progress", "accepted, in progress"),
+        (
+            True,
+            "in progress; took over from position mode",
+            "accepted, in progress; took over from position mode",
+        ),
+        (False, "in progress elsewhere", "failed: in progress elsewhere"),
+    ],
+)
+def test_reply_says_result_and_takeover(success: bool, reason: str, text: str) -> None:
+    assert reply_text({"success": success, "reason": reason}) == text
