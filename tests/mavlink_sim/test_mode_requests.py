@@ -175,8 +175,8 @@ def test_the_base_mode_is_as_measured(mode: Mode, armed: bool, has_setpoints: bo
     assert base_mode(mode, armed, has_setpoints) == expected
 
 
-@pytest.mark.parametrize("release", ["1.14", "1.15"])
-def test_older_release_answers_mode_request_once(release: str) -> None:
+@pytest.mark.parametrize("release", ["1.14", "1.15", "1.18"])
+def test_other_release_answers_mode_request_once(release: str) -> None:
     harness = SimHarness(px4=release)
     harness.take_off()
     assert harness.set_mode(6) == [1]
@@ -184,10 +184,19 @@ def test_older_release_answers_mode_request_once(release: str) -> None:
 
 
 @pytest.mark.parametrize("release", ["1.16", "1.17"])
-def test_a_newer_release_answers_it_twice(release: str) -> None:
+def test_v1_16_and_v1_17_answer_it_twice(release: str) -> None:
     harness = SimHarness(px4=release)
     harness.take_off()
     assert harness.set_mode(6) == [0, 1]
+
+
+@pytest.mark.parametrize(("release", "sent"), [("1.14", False), ("1.15", True)])
+def test_current_mode_since_v1_15_only(release: str, sent: bool) -> None:
+    harness = SimHarness(px4=release)
+    harness.fly(3.0)
+    assert bool(harness.received("CURRENT_MODE")) is sent
+    assert harness.command(512, 436) == [0 if sent else 2]
+    assert harness.command(511, 436, 100_000) == [0 if sent else 4]
 
 
 @pytest.mark.parametrize(("release", "answers"), [("1.16", 0), ("1.17", 1)])
