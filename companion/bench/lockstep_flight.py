@@ -139,6 +139,7 @@ class LockstepFlight:
         self.begun_ns = driver.now_ns
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
+        self._ending = False
         self._results: dict[int, Outcome] = {}
         self._next_frame_ns = [driver.now_ns] * len(self.cameras)
         self._late: deque[tuple[int, PerceptionCamera, Callable[[], PerceptionResult | None]]] = deque()
@@ -310,8 +311,9 @@ class LockstepFlight:
         self._take_state()
         return stepped
 
-    def step(self) -> None:
-        """One step of guidance, now."""
+    def step(self, *, ending: bool = False) -> None:
+        """One step of guidance, now. `ending`: from now on as in a shutdown."""
+        self._ending |= ending
         now_ns = self.now_ns
         commands, self._new = tuple(self._new), []
         output = self.guidance.step(
@@ -322,6 +324,7 @@ class LockstepFlight:
                 StreamStatus(self.streamer.state, self.streamer.sent_count),
                 answers=self.driver.take_answers(),
                 commands=commands,
+                ending=self._ending,
             ),
         )
         apply_output(

@@ -267,7 +267,7 @@ class SimulatedDriver:
                 for name_now, fields in self._profile.translate(name, message.to_dict(), self._state):
                     self._state = apply_message(self._state, name_now, fields, now_ns)
                     if name_now in ("HEARTBEAT", "CURRENT_MODE"):
-                        self._changes.on_report(self._state, now_ns)
+                        self._changes.on_report(self._state, now_ns, self._answered_ns)
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)
@@ -283,7 +283,7 @@ class SimulatedDriver:
         if not self._timesyncs_ns or now_ns - self._timesyncs_ns[-1] >= TIMESYNC_PERIOD_NS:
             self._timesyncs_ns.append(now_ns)
             self.vehicle.send(dialect.MAVLink_timesync_message(0, now_ns))
-        self._changes.tick(now_ns, self._answered_ns)
+        self._changes.tick(now_ns)
         for identifier, change in list(self._changing.items()):
             if change.ending is None:
                 continue

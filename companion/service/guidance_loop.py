@@ -22,7 +22,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
 from companion.vehicle.silence import silence_outcome
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 
 # Reported with the command's own result.
@@ -34,6 +34,20 @@ SLOW_STEP_NS, STALLED_STEP_NS = 5_000_000, 50_000_000
 SLOW_AGAIN_NS = 10_000_000_000
 # How long the shutdown waits for the release of resources such as gimbal control.
 RELEASE_TIMEOUT_S = 3.0
+
+
+def mode_at_shutdown(state: VehicleState, phase: Phase, stream: StreamState) -> FlightMode | None:
+    """The mode to request at shutdown; None: none, since the mode is a pilot's or the autopilot's.
+
+    HOLD for a vehicle that flies our setpoints. Where OFFBOARD is only requested, the mode that shows, so
+    that it remains.
+    """
+    if stream is StreamState.SILENT:
+        return None
+    engaging = phase is Phase.ENGAGING
+    if state.mode is FlightMode.OFFBOARD or (engaging and state.mode is FlightMode.TAKEOFF):
+        return FlightMode.HOLD
+    return state.mode if engaging and state.mode is not FlightMode.UNKNOWN else None
 
 
 class GuidanceLoop:
@@ -104,18 +118,9 @@ class GuidanceLoop:
             self._driver.watch.end_of_loop()
 
     async def shut_down(self) -> None:
-        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD.
-
-        Nothing is requested in another mode, which is a pilot's or the autopilot's. Where OFFBOARD is under
-        way, the mode that shows is requested, so that it remains.
-        """
-        state, mode = self._driver.state, None
-        if self._streamer.state is not StreamState.SILENT:
-            engaging = self.guidance.phase is Phase.ENGAGING
-            if state.mode is FlightMode.OFFBOARD or (engaging and state.mode is FlightMode.TAKEOFF):
-                mode = FlightMode.HOLD
-            elif engaging and state.mode is not FlightMode.UNKNOWN:
-                mode = state.mode
+        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
+        state = self._driver.state
+        mode = mode_at_shutdown(state, self.guidance.phase, self._streamer.state)
         try:
             self.begin_shutdown()
         finally:

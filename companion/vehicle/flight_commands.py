@@ -76,7 +76,8 @@ class FlightCommands:
     def _watch(self, name: str, fields: Fields) -> None:
         """Pass on what the vehicle sends, in its order of arrival."""
         if name in ("HEARTBEAT", "CURRENT_MODE"):
-            self._changes.on_report(self._telemetry.state, self._clock_ns())
+            telemetry = self._telemetry
+            self._changes.on_report(telemetry.state, self._clock_ns(), telemetry.answered_ns)
         elif name == "COMMAND_ACK" and self._ack_is_ours(fields):
             self._changes.on_acknowledgement(fields["command"], fields["result"], self._clock_ns())
 
@@ -132,7 +133,7 @@ class FlightCommands:
                 now_ns = self._clock_ns()
                 if telemetry.restart_count != boots or not telemetry.state.connected(now_ns):
                     self._changes.drop(change, f"{change.what}: the autopilot has restarted or is silent")
-                self._changes.tick(now_ns, telemetry.answered_ns)
+                self._changes.tick(now_ns)
         finally:
             self._pending.discard(change)
             self._changes.drop(change, f"{change.what} was cancelled")

@@ -5,10 +5,10 @@ repeats a command until it is acknowledged; a command that arrives a second time
 pilot who has changed the mode in between. The rules:
 
 1. A change notes the report that it was decided on. It is sent only if that is still the newest report.
-2. It is repeated only if it was lost: no acknowledgement has come, the report at the request is still the
-   newest, and a TIMESYNC that was sent after it has been answered. A link keeps the order, so then nothing
-   of it is under way; at most one message of a change ever is, whatever the delay. Without TIMESYNC answers,
-   and after the link was lost or the autopilot has restarted, nothing is repeated.
+2. It is repeated only if it was lost: no acknowledgement has come, a TIMESYNC that was sent after it has been
+   answered, and after that answer the same mode as at the request is reported. A link keeps the order, so
+   then nothing of it is under way; at most one message of a change ever is, whatever the delay. Without
+   TIMESYNC answers, and after the link was lost or the autopilot has restarted, nothing is repeated.
 3. It ends once the wanted mode is reported. Any other report than the one at the request ends it as well:
    someone else has changed the mode, or the autopilot has by itself. An ended change is never repeated.
 4. The one message that is under way when a pilot changes the mode cannot be called back. So a change is
@@ -18,9 +18,10 @@ pilot who has changed the mode in between. The rules:
    pilot's own choice, and stays. A failsafe of the autopilot is not restored, and nothing is armed again.
 
 PX4 sends one acknowledgement, since 1.16 two to DO_SET_MODE (the first always accepts); both leave before
-the report of the mode. CURRENT_MODE (since 1.15) reports every change. PX4 1.14 reports the mode by HEARTBEAT
-only, once a second, ArduPilot five times a second: a pilot's change that our message overrides before it has
-been reported is known to nobody, and is the one case that is not restored.
+the report of the mode. What is not restored: a pilot's change that our message overrides before it has been
+reported, which is known to nobody, and one whose report or our acknowledgement is lost. CURRENT_MODE (PX4
+since 1.15) reports a change at once, but no second one within 0.1 s; HEARTBEAT alone reports it within 1 s on
+PX4 1.14, and within 0.2 s on ArduPilot.
 """
 
 from __future__ import annotations
@@ -88,6 +89,7 @@ class ModeChange:
     sent_ns: int = 0
     acknowledged_ns: int | None = None
     in_progress: bool = False
+    lost: bool = False  # its last message was
     shown: bool = False
     other: VehicleState | None = None  # the newest report of someone else's change
     arrived_since: bool = False  # an acknowledgement has come since that report
@@ -168,8 +170,12 @@ class ModeChanges:
 
     # --- what the vehicle sends ---------------------------------------------------------------------
 
-    def on_report(self, state: VehicleState, now_ns: int) -> None:
-        """Process the state after a HEARTBEAT or CURRENT_MODE."""
+    def on_report(self, state: VehicleState, now_ns: int, answered_ns: int) -> None:
+        """Process the state after a HEARTBEAT or CURRENT_MODE.
+
+        Args:
+            answered_ns: when the newest answered TIMESYNC was sent, CLOCK_MONOTONIC.
+        """
         last, self._reported = self._reported, state
         change = self._newest
         if change is None or not change.attempts:
@@ -177,6 +183,7 @@ class ModeChanges:
         if change.ending is not None and now_ns - change.sent_ns > IN_FLIGHT_S * 1e9:
             self._newest = None
         elif not change.shows(state):
+            change.lost = answered_ns >= change.sent_ns + ANSWER_S * 1e9
             self._on_another(change, state, now_ns)
         elif change.other is None:
             change.shown = True
@@ -231,18 +238,17 @@ class ModeChanges:
 
     # --- time ---------------------------------------------------------------------------------------
 
-    def tick(self, now_ns: int, answered_ns: int) -> None:
-        """Repeat or end the pending change. `answered_ns`: when the newest answered TIMESYNC was sent."""
+    def tick(self, now_ns: int) -> None:
+        """Repeat or end the pending change."""
         change = self._newest
         if change is None or change.ending is not None:
             return
         if change.acknowledged_ns is None and not change.shown:
             since_s = (now_ns - change.sent_ns) / 1e9
-            lost = answered_ns >= change.sent_ns + ANSWER_S * 1e9
             if now_ns - change.begun_ns >= ATTEMPTS * ATTEMPT_S * 1e9:
                 repeated = f"{change.attempts} attempts in {ATTEMPTS * ATTEMPT_S:g} s"
                 self._end(change, Ending.NO_ANSWER, f"no answer to command {change.command} ({repeated})")
-            elif since_s >= ATTEMPT_S and lost:
+            elif since_s >= ATTEMPT_S and change.lost:
                 self._transmit(change, now_ns)
         elif change.in_progress:
             if now_ns - (change.acknowledged_ns or 0) > PROGRESS_S * 1e9:
@@ -264,7 +270,7 @@ class ModeChanges:
             if not change.attempts:
                 self._end(change, Ending.DROPPED, f"{change.what} not sent: the request has expired")
             return
-        change.sent_ns = now_ns
+        change.sent_ns, change.lost = now_ns, False
         change.attempts += 1
         self._send(change.command, change.parameters, change.attempts - 1)
 

@@ -39,6 +39,7 @@ class Sender:
         self.restored: list[str] = []
         self.now_s = 100.0
         self.answered_s = 0.0
+        self.newest: VehicleState | None = None
         self.changes = ModeChanges(
             lambda command, values, confirmation: self.sent.append((command, values[-1])),
             lambda custom_mode: (custom_mode, custom_mode),
@@ -55,29 +56,34 @@ class Sender:
         change = ModeChange(
             f"mode {wanted.mode}", DO_SET_MODE, (1, wanted.custom_mode), before, wanted.custom_mode
         )
-        self.changes.begin(change, state or before, self.now_ns)
+        self.newest = state or before
+        self.changes.begin(change, self.newest, self.now_ns)
         return change
 
     def arm(self, before: VehicleState) -> ModeChange:
+        self.newest = before
         change = ModeChange("arming", ARM_DISARM, (1.0,), before, None, armed=True)
         self.changes.begin(change, before, self.now_ns)
         return change
 
     def report(self, *states: VehicleState) -> None:
         for state in states:
-            self.changes.on_report(state, self.now_ns)
+            self.newest = state
+            self.changes.on_report(state, self.now_ns, round(self.answered_s * 1e9))
 
     def acknowledge(self, *results: int, command: int = DO_SET_MODE) -> None:
         for result in results:
             self.changes.on_acknowledgement(command, result, self.now_ns)
 
-    def wait(self, seconds: float, *, answered: bool = True) -> None:
-        """Let time pass; TIMESYNC is answered at once."""
+    def wait(self, seconds: float, *, answered: bool = True, reported: bool = True) -> None:
+        """Let time pass; the newest report comes again and again, and TIMESYNC is answered at once."""
         for _ in range(round(seconds / 0.05)):
             self.now_s += 0.05
             if answered:
                 self.answered_s = self.now_s
-            self.changes.tick(self.now_ns, round(self.answered_s * 1e9))
+            if reported and self.newest is not None:
+                self.report(self.newest)
+            self.changes.tick(self.now_ns)
 
 
 @pytest.fixture
@@ -102,9 +108,10 @@ def test_unanswered_request_ends_after_its_attempts(sender: Sender) -> None:
     assert (change.ending, len(sender.sent)) == (Ending.NO_ANSWER, 5)
 
 
-def test_request_that_may_be_under_way_is_not_repeated(sender: Sender) -> None:
+@pytest.mark.parametrize("missing", ["answered", "reported"])
+def test_request_that_may_have_arrived_is_not_repeated(sender: Sender, missing: str) -> None:
     sender.begin(HOLD, OFFBOARD)
-    sender.wait(2.0, answered=False)
+    sender.wait(2.0, **{missing: False})
     assert len(sender.sent) == 1
 
 

@@ -1,0 +1,231 @@
+"""Whatever we request, over whatever link: the last mode is the pilot's.
+
+Every sender of modes, with each fault of the link, and a pilot who changes the mode at each moment of the
+request, in lockstep. `test_mode_changes` has the rules one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import pytest
+
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.bench.simulated_driver import RATES_HZ
+from companion.guidance.interface import Request, SetMode
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.mode_control import Phase
+from companion.service.guidance_loop import mode_at_shutdown
+from companion.vehicle.state import FlightMode
+from mavlink_sim.lockstep import LockstepVehicle
+from mavlink_sim.px4.modes import Mode
+
+EVERY_S = 0.05
+PILOTS = Mode.POSCTL
+SHUTDOWN = 99  # identifier of its request
+FENCE = {"GF_ACTION": 2.0, "GF_MAX_HOR_DIST": 14.0}
+
+
+@dataclass(frozen=True)
+class Sender:
+    """One sender of modes.
+
+    Attributes:
+        prepare: before the fault of the link. ready: with it, until shortly before the request.
+        begin: requests. round_trips, more_s: how long that takes.
+    """
+
+    prepare: Callable[[LockstepFlight], None]
+    begin: Callable[[LockstepFlight], None]
+    round_trips: int = 1
+    more_s: float = 0.4
+    ready: Callable[[LockstepFlight], None] = lambda flight: None
+
+
+def nothing(flight: LockstepFlight) -> None:
+    """The flight is in HOLD."""
+
+
+def engage(flight: LockstepFlight) -> None:
+    flight.command("hold")
+    assert flight.run_until(lambda: flight.guidance.phase is Phase.OFFBOARD, 10.0)
+    flight.run(0.5)
+
+
+def approach_fence(flight: LockstepFlight) -> None:
+    for name, value in FENCE.items():
+        flight.vehicle.vehicle.parameters.set(name, value)
+    flight.command("goto 45 0")
+    assert flight.run_until(lambda: flight.vehicle.truth.position_ned_m[0] > 3.0, 30.0)
+
+
+def breach(flight: LockstepFlight) -> None:
+    assert flight.run_until(lambda: flight.vehicle.truth.mode == "HOLD", 30.0)
+
+
+def shut_down(flight: LockstepFlight) -> None:
+    """As `GuidanceLoop.shut_down`."""
+    mode = mode_at_shutdown(flight.state, flight.guidance.phase, flight.streamer.state)
+    flight.step(ending=True)
+    if mode is not None:
+        flight.driver.start(Request(SHUTDOWN, SetMode(mode)))
+
+
+def by(text: str) -> Callable[[LockstepFlight], None]:
+    def command(flight: LockstepFlight) -> None:
+        flight.command(text)
+
+    return command
+
+
+def start_mission(flight: LockstepFlight) -> None:
+    text = '[[step]]\ndo = "hold 0.5"\n[[step]]\ndo = "land"\n'
+    flight.command(SequenceBehaviour(plan_from(text, "test.toml"), flight.guidance.check_requirements))
+
+
+def end_soon(flight: LockstepFlight) -> None:
+    """A shutdown while OFFBOARD is being requested."""
+    flight.command("hold")
+    flight.run(0.15)
+    shut_down(flight)
+
+
+SENDERS = {
+    "takeoff": Sender(nothing, by("takeoff 3"), round_trips=2, more_s=1.0),
+    "goto": Sender(nothing, by("goto 20 0")),
+    "stop": Sender(engage, by("stop")),
+    "land": Sender(engage, by("land")),
+    "rtl": Sender(engage, by("rtl")),
+    "land-from-hold": Sender(nothing, by("land")),
+    "mission": Sender(nothing, start_mission, round_trips=2, more_s=1.2),
+    "yield": Sender(approach_fence, nothing, more_s=1.5, ready=breach),
+    "shutdown": Sender(engage, shut_down),
+    "shutdown-engaging": Sender(nothing, end_soon),
+}
+FAULTS = {
+    "none": ([], 0.0),
+    "acknowledgements lost": (["lost_ack"], 0.0),
+    "requests lost": (["packet_loss 0.6 way=in"], 0.0),
+    "delay 0.1": (["link_delay 0.1"], 0.1),
+    "delay 0.3": (["link_delay 0.3"], 0.3),
+    "delay 1": (["link_delay 1"], 1.0),
+    "duplicates": (["duplicate 1", "link_delay 0.1"], 0.1),
+}
+
+
+@cache
+def parked(px4: str) -> LockstepVehicle:
+    vehicle = LockstepVehicle({"onboard": rates(px4)}, seed=3, px4=px4)
+    vehicle.step(8.0)
+    return vehicle
+
+
+def rates(px4: str) -> dict[str, float]:
+    """PX4 1.14 has no CURRENT_MODE."""
+    return (
+        RATES_HZ if px4 != "1.14" else {name: hz for name, hz in RATES_HZ.items() if name != "CURRENT_MODE"}
+    )
+
+
+@cache
+def airborne(px4: str) -> LockstepVehicle:
+    vehicle = LockstepVehicle({"onboard": rates(px4)}, seed=3, px4=px4)
+    vehicle.take_off(6.0, limit_s=90.0)
+    return vehicle
+
+
+class PilotedFlight:
+    """One flight with one change of the pilot. `seen`: modes as reported, in order."""
+
+    def __init__(self, sender: str, fault: str, px4: str) -> None:
+        self.sender, (commands, self.delay_s) = SENDERS[sender], FAULTS[fault]
+        vehicle = (parked if sender == "takeoff" else airborne)(px4).copy()
+        self.flight = LockstepFlight.of_vehicle(vehicle, settings=plain_settings())
+        self.flight.run(0.3)
+        self.sender.prepare(self.flight)
+        for command in commands:
+            vehicle.vehicle.faults.begin(command)
+        self.flight.run(2 * self.delay_s + 0.2)
+        self.sender.ready(self.flight)
+        # A lost acknowledgement cannot tell that ours has arrived after a change that was not read yet.
+        self.read_at_once = "lost_ack" in commands
+        self.seen: list[FlightMode] = []
+
+    def fly(self, pilot_s: float) -> Mode:
+        """The pilot changes the mode so long after the request; 0: just before it. Returns the last mode."""
+        if not pilot_s:
+            self._pilot()
+        self.sender.begin(self.flight)
+        if pilot_s:
+            self._run(pilot_s)
+            self._pilot()
+        self._run(3.0 + 4 * self.delay_s)
+        return self.flight.vehicle.vehicle.autopilot.mode
+
+    def _pilot(self) -> None:
+        self.flight.vehicle.vehicle.autopilot.pilot_takes_over(PILOTS)
+        # Until it is reported. A change that ours overrides within these 4 ms is known to nobody.
+        step = self.flight.driver.step if self.read_at_once else self.flight.vehicle.step
+        step(0.004)
+
+    def _run(self, seconds: float) -> None:
+        for _ in range(round(seconds / 0.01)):
+            self.flight.tick()
+            if self.seen[-1:] != [self.flight.state.mode]:
+                self.seen.append(self.flight.state.mode)
+
+
+def moments(sender: str, fault: str, every_s: float) -> list[float]:
+    """Of a pilot's change, from just before the request until its effect was reported."""
+    course_s = SENDERS[sender].more_s + 2 * FAULTS[fault][1] * SENDERS[sender].round_trips
+    return [number * every_s for number in range(round(course_s / every_s) + 1)]
+
+
+def unknowable(sender: str, fault: str, pilot_s: float) -> bool:
+    """Whether nothing tells a change of that moment, just before the request, from one after it.
+
+    PX4 reports no second change within 0.1 s, here that of the pilot after that of the failsafe; and without
+    acknowledgements the report of our mode may as well be of the pilot's own choice.
+    """
+    return not pilot_s and (sender == "yield" or fault == "acknowledgements lost")
+
+
+def overridden(
+    sender: str, fault: str, moments_s: list[float], px4: str = "1.17"
+) -> list[tuple[float, Mode, list[str]]]:
+    """The moments of a pilot's change after which the mode is another one, with the reported modes."""
+    found = []
+    for pilot_s in moments_s:
+        if unknowable(sender, fault, pilot_s):
+            continue
+        flight = PilotedFlight(sender, fault, px4)
+        if (mode := flight.fly(pilot_s)) is not PILOTS:
+            found.append((pilot_s, mode, [str(mode) for mode in flight.seen]))
+    return found
+
+
+@pytest.mark.parametrize("fault", ["none", "requests lost", "delay 0.3", "delay 1", "duplicates"])
+@pytest.mark.parametrize("sender", SENDERS)
+def test_last_mode_is_the_pilots(sender: str, fault: str) -> None:
+    delay_s = FAULTS[fault][1]
+    assert overridden(sender, fault, [0.0, 0.1 + delay_s / 2, 0.15 + 1.5 * delay_s]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("px4", ["1.15", "1.17"])
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("sender", SENDERS)
+def test_last_mode_is_the_pilots_at_each_moment(sender: str, fault: str, px4: str) -> None:
+    assert overridden(sender, fault, moments(sender, fault, EVERY_S), px4) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("sender", SENDERS)
+def test_change_that_px4_1_14_reports_is_the_last(sender: str, fault: str) -> None:
+    """It reports the mode once a second: a change that ours overrides before that is known to nobody."""
+    found = overridden(sender, fault, moments(sender, fault, EVERY_S), "1.14")
+    assert [one for one in found if str(FlightMode.POSITION) in one[2]] == []
