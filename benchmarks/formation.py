@@ -31,7 +31,6 @@ from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleSta
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES
 from companion.vehicle.vision_position import VisionPosition
 from mavlink_sim import LockstepVehicle
-from mavlink_sim.lockstep import COMPANION
 from mavlink_sim.vehicles.vehicle import BACKGROUND_GUSTS_MPS, GUST_SHARE_OF_WIND
 from mavlink_sim.wire.streams import ONBOARD_RATES_HZ
 from vision.attitude import quaternion_from_euler, wrap_angle
@@ -259,7 +258,7 @@ class Fleet:
     def add(self, name: str, airframe: LockstepAirframe | PointAirframe) -> Member:
         """A vehicle that hovers where it is, under its companion's hold."""
         settings = plain_settings({"vehicle.name": name})
-        options = replace(guidance_options(settings, COMPANION), limits=self._limits)
+        options = replace(guidance_options(settings), limits=self._limits)
         member = Member(name, airframe, LockstepFlight(airframe, settings, options=options))
         member.flight.command(HoldBehaviour())
         self.members[name] = member

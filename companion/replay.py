@@ -114,7 +114,7 @@ def replay(paths: Sequence[Path], changes: Mapping[str, str], model: str | None 
         recorded_settings = Settings.from_json(run["settings"])
     except ValueError as error:  # also of pydantic
         raise RecordingError(f"{paths[0]}: its settings cannot be read: {_first_line(error)}") from error
-    options, changed_settings = _changed_options(options, recorded_settings, run["own_address"], changes)
+    options, changed_settings = _changed_options(options, recorded_settings, changes)
     found = Replay(run["vehicle"], run["version"], changed_settings)
     timeline = Timeline()
     perception = None if model is None else PerceptionReplay(paths, recorded_settings, model, timeline)
@@ -143,10 +143,9 @@ def _run_of(paths: Sequence[Path]) -> dict[str, Any]:
 
 
 def _changed_options(
-    options: GuidanceOptions, recorded: Settings, own_address: Sequence[int], changes: Mapping[str, str]
+    options: GuidanceOptions, recorded: Settings, changes: Mapping[str, str]
 ) -> tuple[GuidanceOptions, list[ChangedSetting]]:
-    system, component = own_address
-    before = guidance_options(recorded, (system, component))
+    before = guidance_options(recorded)
     listed = []
     for key, text in changes.items():
         if not key.startswith("guidance."):
@@ -154,11 +153,11 @@ def _changed_options(
         settings = changed(recorded, {key: text})
         name = key.partition(".")[2]
         old, new = getattr(recorded.guidance, name), getattr(settings.guidance, name)
-        after = guidance_options(settings, (system, component))
+        after = guidance_options(settings)
         if old != new and after == before:
             raise ConfigurationError(f"{key}: Guidance.step does not depend on it; its inputs are recorded")
         listed.append(ChangedSetting(key, old, new))
-    after = guidance_options(changed(recorded, changes), (system, component))
+    after = guidance_options(changed(recorded, changes))
     different = {
         each.name: getattr(after, each.name)
         for each in fields(GuidanceOptions)

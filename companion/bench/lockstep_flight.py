@@ -35,7 +35,7 @@ from companion.settings import Settings
 from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from mavlink_sim.lockstep import COMPANION, LockstepVehicle, Truth
+from mavlink_sim.lockstep import LockstepVehicle, Truth
 from vision.pipeline import PerceptionResult
 
 TICK_S = 0.01
@@ -132,7 +132,7 @@ class LockstepFlight:
         )
         if isinstance(driver, SimulatedDriver):
             self.inputs.parameters = driver.parameters
-        self.guidance = Guidance(options or guidance_options(settings, COMPANION))
+        self.guidance = Guidance(options or guidance_options(settings))
         self.streamer = streamer_of(settings, driver.send_setpoint, lambda: driver.now_ns)
         self.events: list[GuidanceEvent] = []
         self.state_words: list[str] = []
@@ -187,7 +187,7 @@ class LockstepFlight:
     ) -> LockstepFlight:
         """As `airborne`, with a vehicle that is ready, for example a copy of `vehicle_in_the_air`."""
         chosen = settings or (plain_settings() if camera is None else camera.perceived.settings)
-        guided = guidance_options(chosen, COMPANION)
+        guided = guidance_options(chosen)
         guided = replace(guided, limits=limits or guided.limits, obstacles=rules or guided.obstacles)
         driver = SimulatedDriver(vehicle, range_finder_height=chosen.guidance.range_finder_height)
         return cls(driver, chosen, [] if camera is None else [camera], guided)

@@ -38,7 +38,6 @@ from companion.guidance.setpoint_output import SetpointOutput
 from companion.guidance.targets.chosen import RecentTracks
 from companion.guidance.targets.closing_check import ClosingCheck
 from companion.guidance.targets.target import Target
-from companion.vehicle.gimbal import Address
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 from companion.vehicle.state import VehicleState
@@ -57,14 +56,12 @@ class GuidanceOptions:
     """The operator's settings of guidance.
 
     Attributes:
-        own_address: system and component id of our messages.
         lifetime_s: lifetime of every setpoint; overrides the behaviour's.
         perception_max_age_s: maximum age of targets.
         track_max_age_s: a track unseen for so long has ended.
     """
 
     limits: Limits = Limits()  # noqa: RUF009 - frozen
-    own_address: Address = (1, 191)
     lifetime_s: float = DEFAULT_LIFETIME_S
     battery: BatteryMinimum = NO_MINIMUM
     obstacles: ObstacleRules = NO_RULES
@@ -84,7 +81,7 @@ class Guidance:
 
     def __init__(self, options: GuidanceOptions | None = None) -> None:
         self._options = options = options or GuidanceOptions()
-        self.gimbal = GimbalController(options.own_address, options.gimbal)
+        self.gimbal = GimbalController(options.gimbal)
         self._out = OutputCollector()
         self._setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
         self._modes = ModeControl(self._setpoints, self._out)

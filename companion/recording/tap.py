@@ -23,7 +23,6 @@ from companion.recording.guidance_record import LAYOUT, StepContext, input_recor
 from companion.recording.link_bytes import LinkBytes, pack_link_bytes
 from companion.settings import Settings
 from companion.settings.perception import NO_SOURCE
-from companion.vehicle.gimbal import Address
 
 logger = logging.getLogger(__name__)
 
@@ -35,9 +34,7 @@ _RUN_PERIOD_S = 1.0
 _RECORDER_STARTS_S = 15.0
 
 
-def run_record(
-    settings: Settings, options: GuidanceOptions, own_address: Address, service: str
-) -> dict[str, Any]:
+def run_record(settings: Settings, options: GuidanceOptions, service: str) -> dict[str, Any]:
     """Describe this run of the service, as JSON-able data: what a replay needs besides the inputs.
 
     Of the settings it has no address, file of a key or source.
@@ -55,7 +52,6 @@ def run_record(
         "vehicle": settings.vehicle.name,
         "service": service,
         "unix_offset_ns": time.time_ns() - time.monotonic_ns(),
-        "own_address": list(own_address),
         "options": encode(GuidanceOptions, options),
         "settings": values,
     }

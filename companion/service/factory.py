@@ -19,9 +19,9 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.perception.cameras import recorded_frames_names
 from companion.settings import CameraSection, Settings
+from companion.settings.vehicle import COMPONENT_IDS
 from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.drivers import open_driver
-from companion.vehicle.gimbal import Address
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.signing import read_key
 from companion.vehicle.streamer import Streamer
@@ -39,6 +39,8 @@ def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
         settings.vehicle.url,
         system_id=settings.vehicle.system_id,
         own_system_id=settings.vehicle.system_id,
+        own_component_id=settings.vehicle.component_id,
+        other_component_ids=[number for number in COMPONENT_IDS if number != settings.vehicle.component_id],
         signing_key=None
         if settings.vehicle.signing_key_file is None
         else read_key(settings.vehicle.signing_key_file),
@@ -47,13 +49,12 @@ def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
     )
 
 
-def guidance_options(settings: Settings, own_address: Address) -> GuidanceOptions:
-    """Create guidance's options. `own_address`: system and component id of our messages."""
+def guidance_options(settings: Settings) -> GuidanceOptions:
+    """Create guidance's options."""
     guidance = settings.guidance
     cameras = [settings.of_camera(name).camera for name in (None, *settings.cameras)]
     return GuidanceOptions(
         limits=limits_of(settings),
-        own_address=own_address,
         lifetime_s=guidance.setpoint_lifetime_s,
         battery=BatteryMinimum(guidance.min_battery_percent / 100.0, guidance.low_battery),
         obstacles=ObstacleRules(

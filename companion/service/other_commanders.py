@@ -3,6 +3,9 @@
 Two services on one vehicle both stream setpoints, and it follows them alternately. Another service is
 detected by its HEARTBEAT, which the autopilot forwards from its other links (`vehicle/commander.py`), and by
 its `status` under the same name on the network. The one with the longer uptime may engage; the other refuses.
+
+Any program that commands the vehicle is also detected by its effect: an acknowledgement, to our address, of a
+command that we did not send; on PX4 also OFFBOARD, which it leaves without setpoints, while we send none.
 """
 
 from __future__ import annotations
@@ -15,12 +18,17 @@ from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
 from companion.peer_data import PeerDataError, parse_object
 from companion.settings.vehicle import VehicleSection
-from companion.vehicle.state import VehicleState
+from companion.vehicle.gimbal import Address, address_text
+from companion.vehicle.state import FlightMode, VehicleState
 
+FOREIGN_COMMAND = "commands with our own address"
+FOREIGN_OFFBOARD = "setpoints in OFFBOARD"
 # Heartbeats and `status` are sent once a second.
 GONE_AFTER_S = 3.5
 # Uptimes are whole seconds, and delayed: of two services started this close together neither is the first.
 SAME_START_S = 2.0
+# PX4 leaves OFFBOARD after COM_OF_LOSS_T without setpoints, 1 s by default.
+FOREIGN_OFFBOARD_S = 5.0
 # Services known by their status.
 MOST_SERVICES = 16
 
@@ -63,6 +71,9 @@ class OtherCommanders:
         self._service, self._started_ns, self._on_event = service, started_ns, on_event
         self._by_status: dict[str, _Other] = {}
         self._reported: dict[tuple[str, str], _Other] = {}
+        self._address: Address = (settings.system_id, settings.component_id)
+        self._shared = False
+        self._offboard_since_ns: int | None = None
 
     def uptime_s(self, now_ns: int) -> float:
         """Uptime of this service, seconds."""
@@ -101,10 +112,34 @@ class OtherCommanders:
             for commander in state.other_commanders
             if _is_recent(commander.received_ns, now_ns)
         ]
-        return [*by_heartbeat, *self._by_status.values()]
+        return [*by_heartbeat, *self._by_status.values(), *self._by_effect(state, now_ns)]
 
-    def watch(self, state: VehicleState, now_ns: int) -> None:
-        """Report services that have appeared or disappeared, once each."""
+    def _by_effect(self, state: VehicleState, now_ns: int) -> list[_Other]:
+        """Return what only the vehicle shows."""
+        found = []
+        commanded_ns, since_ns = state.foreign_command_ns, self._offboard_since_ns
+        if commanded_ns and _is_recent(commanded_ns, now_ns):
+            found.append(_Other("mavlink", FOREIGN_COMMAND, commanded_ns, commanded_ns, True))
+        if since_ns is not None and now_ns - since_ns >= FOREIGN_OFFBOARD_S * 1e9:
+            found.append(_Other("mavlink", FOREIGN_OFFBOARD, now_ns, since_ns, True))
+        return found
+
+    def shares_address(self, state: VehicleState, now_ns: int) -> bool:
+        """Whether another program has sent lately with our MAVLink address."""
+        return state.address_shared_ns > 0 and _is_recent(state.address_shared_ns, now_ns)
+
+    def watch(self, state: VehicleState, now_ns: int, *, in_command: bool = False) -> None:
+        """Report services that have appeared or disappeared, once each; call it once a second.
+
+        Args:
+            in_command: whether we are in command.
+        """
+        self._watch_address(state, now_ns)
+        flies_setpoints = state.autopilot == "PX4" and state.mode is FlightMode.OFFBOARD and state.armed
+        if in_command or not flies_setpoints or not state.connected(now_ns):
+            self._offboard_since_ns = None
+        elif self._offboard_since_ns is None:
+            self._offboard_since_ns = now_ns
         present = {(other.via, other.identity): other for other in self.present(state, now_ns)}
         for key, other in present.items():
             if key not in self._reported:
@@ -113,6 +148,17 @@ class OtherCommanders:
             if key not in present:
                 self._on_event("info", f"other service gone: {other.identity} by {other.via}")
         self._reported = present
+
+    def _watch_address(self, state: VehicleState, now_ns: int) -> None:
+        """Report a change of our MAVLink address, and another program that sends with it."""
+        before, self._address = self._address, state.own_address
+        if self._address != before:
+            taken, now = address_text(before), address_text(self._address)
+            self._on_event("warning", f"our MAVLink address is {now}: another program has {taken}")
+        was_shared, self._shared = self._shared, self.shares_address(state, now_ns)
+        if self._shared and not was_shared:
+            own = address_text(self._address)
+            self._on_event("error", f"another program sends with our MAVLink address {own}; end one of them")
 
     def check_requirements(
         self, command: CommandInput, state: VehicleState, *, in_command: bool, now_ns: int

@@ -74,7 +74,7 @@ class Service:
         self.events, self._event = log.newest, log.add
         self.driver: Driver = driver_of(settings, lambda sent, data: self._tap.on_bytes(sent, data))
         self.streamer = streamer_of(settings, self.driver.send_setpoint, self.driver.watch.now_ns)
-        self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
+        self.guidance = Guidance(guidance_options(settings))
         self.cameras = open_cameras(
             settings,
             on_result=self._on_result,
@@ -101,7 +101,7 @@ class Service:
         )
         self._tap = FlightTap(
             self.bus,
-            run_record(settings, self.guidance.options, self.driver.own_address, self.inputs.poses.source),
+            run_record(settings, self.guidance.options, self.inputs.poses.source),
             expected=bool(settings.recording.directory),
         )
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)

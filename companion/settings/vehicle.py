@@ -9,6 +9,9 @@ from pydantic import Field
 from companion.settings.section import Section
 from companion.settings.texts import KeyWord, VehicleUrl
 
+# MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4
+COMPONENT_IDS = (191, 192, 193, 194)
+
 
 class VehicleSection(Section):
     """The autopilot, and the vehicle's name."""
@@ -19,6 +22,8 @@ class VehicleSection(Section):
     """MAVLink library; pymavlink (also auto) flies PX4 and ArduPilot, mavsdk PX4 only"""
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     """the autopilot's MAVLink system id"""
+    component_id: Annotated[int, Field(ge=COMPONENT_IDS[0], le=COMPONENT_IDS[-1])] = COMPONENT_IDS[0]
+    """our MAVLink component id; where another program has it, another one of 191 to 194 is used"""
     name: KeyWord = "vehicle1"
     """the vehicle's name in zenoh keys: companion/NAME/detections"""
     connect_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0

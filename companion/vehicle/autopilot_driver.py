@@ -9,11 +9,12 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import random
 import struct
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -28,13 +29,14 @@ from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_t
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, frames_of, is_signed, pack_frame
-from companion.vehicle.gimbal import Address, GimbalAim
+from companion.vehicle.gimbal import Address, GimbalAim, address_text
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.harmless import is_harmless
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
+from companion.vehicle.own_address import LISTEN_JITTER_S, LISTEN_S, OwnAddress
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
 from companion.vehicle.signing import FrameSigner
@@ -71,6 +73,7 @@ _VERSION_TIMEOUT_S = 2.0
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
 _TIMESYNCS_KEPT = 8  # those of the last 4 s
+_MOST_OTHERS = 64  # senders that are logged
 
 
 class AutopilotDriver(ABC):
@@ -86,6 +89,7 @@ class AutopilotDriver(ABC):
         system_id: int | None,
         own_system_id: int,
         own_component_id: int,
+        other_component_ids: Sequence[int] = (),
         signing_key: bytes | None = None,
         range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
@@ -95,10 +99,12 @@ class AutopilotDriver(ABC):
         self._signer = None if signing_key is None else FrameSigner(signing_key)
         self._wanted_system_id = system_id
         self._own_system_id = own_system_id
-        self._own_component_id = own_component_id
+        self._address = OwnAddress(own_system_id, own_component_id, other_component_ids)
         self.watch = StandstillWatch()
         self._started_ns = time.monotonic_ns()
-        self._telemetry = TelemetryState(url, self._warn_other_autopilot, range_finder_height)
+        self._telemetry = TelemetryState(
+            url, self._warn_other_autopilot, range_finder_height, self._address.address
+        )
         self._flight_commands = FlightCommands(
             url,
             self._telemetry,
@@ -108,7 +114,7 @@ class AutopilotDriver(ABC):
             self._no_answer,
             lambda: self.watch.now_ns(),
         )
-        self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command, self.own_address)
+        self._gimbal_commands = GimbalCommands(url, self._telemetry, self._command)
         self._command_locks: dict[int, asyncio.Lock] = {}
         self._link: ByteLink | None = None
         self._reset()
@@ -122,6 +128,7 @@ class AutopilotDriver(ABC):
         self._newest_heartbeat: Frame | None = None
         self._timesync_sent_ns = 0
         self._timesyncs_ns: deque[int] = deque(maxlen=_TIMESYNCS_KEPT)
+        self._address.forget()
         self._heartbeat_received = asyncio.Event()
         self._version: FirmwareVersion | None = None
         self._version_received = asyncio.Event()
@@ -140,7 +147,6 @@ class AutopilotDriver(ABC):
             lambda: (self._system_id or 0, AUTOPILOT_COMPONENT),
         )
         self._sequence = 0
-        self._own_heartbeats: deque[tuple[int, int]] = deque(maxlen=16)  # (sequence number, custom_mode)
         self._tasks: list[asyncio.Task[None]] = []
 
     # --- the encoding, implemented by subclasses ------------------------------------------------------
@@ -194,9 +200,11 @@ class AutopilotDriver(ABC):
         except TimeoutError as error:
             raise LinkError(f"{self.url}: could not be opened within {timeout_s:g} s") from error
         try:
+            opened_s = time.monotonic()
             await self._first_heartbeat(timeout_s)
             if self._autopilot_kind not in self.supported_autopilots:
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
+            await self._choose_address(opened_s)
             await self._attach(max(deadline - time.monotonic(), 1.0))
         except BaseException:
             await self.close()
@@ -237,7 +245,7 @@ class AutopilotDriver(ABC):
             async with asyncio.timeout(timeout_s):
                 while not self._heartbeat_received.is_set():
                     if self.url.scheme is not LinkScheme.UDP_IN:
-                        self.send_heartbeat(SystemStatus.ACTIVE)
+                        self._prompt()
                     await _wait_event(self._heartbeat_received, 1.0)
         if not self._heartbeat_received.is_set():
             raise LinkError(
@@ -250,6 +258,47 @@ class AutopilotDriver(ABC):
                     skipped_bytes=self._framer.skipped_bytes,
                 )
             )
+
+    def _prompt(self) -> None:
+        """Send a heartbeat, so that the peer learns where we are, before our address is chosen.
+
+        A router forwards nothing to us that has an address with which we have sent. So this one has the last
+        address that would be chosen, and not the mark of a service.
+        """
+        payload = _HEARTBEAT.pack(0, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(SystemStatus.ACTIVE), 3)
+        self._transmit_payload(HEARTBEAT_ID, payload, self._address.last)
+
+    async def _choose_address(self, opened_s: float) -> None:
+        """Wait for the heartbeats of other programs, before the first own one, and choose a free address."""
+        if not self._address.others:
+            return
+        until_s = opened_s + LISTEN_S + random.uniform(0.0, LISTEN_JITTER_S)
+        await asyncio.sleep(max(until_s - time.monotonic(), 0.0))
+        before = self._address.address
+        if self._address.is_taken(time.monotonic_ns()) and self._address.change(time.monotonic_ns()):
+            self._telemetry.use_address(self._address.address)
+            logger.warning(
+                "%s: MAVLink address %s is used by another program: ours is %s",
+                self.url,
+                address_text(before),
+                address_text(self._address.address),
+            )
+        self.send_heartbeat(SystemStatus.ACTIVE)  # others that listen now see that it is taken
+
+    def change_address(self) -> bool:
+        """See Driver."""
+        gimbal = self._telemetry.state.gimbal
+        if gimbal is not None and gimbal.primary_control == self._address.address:
+            return False
+        if not self._can_change_address or not self._address.change(time.monotonic_ns(), at_random=True):
+            return False
+        self._telemetry.use_address(self._address.address)
+        return True
+
+    @property
+    def _can_change_address(self) -> bool:
+        """Whether the encoding allows another address now."""
+        return True
 
     # --- receiving ----------------------------------------------------------------------------------
 
@@ -270,7 +319,7 @@ class AutopilotDriver(ABC):
             elif frame.message_id == _NAMED_VALUE_INT_ID:
                 _, value, name = _NAMED_VALUE_INT.unpack(frame.padded(_NAMED_VALUE_INT.size))
                 if name.rstrip(b"\0") == COMMANDER_NAME:
-                    self._commander_from(frame, ONBOARD_CONTROLLER, value)
+                    self._commander_from(frame, source, ONBOARD_CONTROLLER, value)
             if frame.system_id == self._system_id and source == self._source:
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
@@ -326,7 +375,8 @@ class AutopilotDriver(ABC):
         wanted = self._wanted_system_id if self._system_id is None else self._system_id
         if not is_autopilot or wanted not in (None, frame.system_id):
             self._note_other(sender, "system/component %d/%d is also on this link")
-            self._commander_from(frame, mav_type, custom_mode)
+            self._on_other_heartbeat(frame, source, custom_mode)
+            self._commander_from(frame, source, mav_type, custom_mode)
             return
         if self._system_id is None:
             self._system_id, self._autopilot_kind = frame.system_id, autopilot
@@ -339,6 +389,7 @@ class AutopilotDriver(ABC):
             )
             return
         self._source = source
+        self._address.only_from(source)
         if self._link is not None:
             self._link.answer_to(source)
         self._newest_heartbeat = frame
@@ -360,19 +411,36 @@ class AutopilotDriver(ABC):
             self._telemetry.handle("CURRENT_MODE", fields)
 
     def _acknowledgement_from(self, frame: Frame) -> None:
-        """Apply a COMMAND_ACK here: its order among the reports of the mode counts (`mode_changes`)."""
+        """Apply a COMMAND_ACK here: its order among the reports of the mode counts (`mode_changes`).
+
+        One that we have not asked for shows another program with our address.
+        """
         if self._autopilot_kind in self.supported_autopilots:
+            now_ns = time.monotonic_ns()
             command, result, *_, system, component = _COMMAND_ACK.unpack(frame.padded(_COMMAND_ACK.size))
+            if (system, component) == self.own_address and self._address.is_foreign_ack(command, now_ns):
+                self._telemetry.on_shared_address(now_ns, commands=True)
             target = {"target_system": system, "target_component": component}
             self._telemetry.handle("COMMAND_ACK", {"command": command, "result": result, **target})
 
-    def _commander_from(self, frame: Frame, mav_type: int, custom_mode: int) -> None:
-        """Note another service on this vehicle, if the heartbeat is one's."""
+    def _on_other_heartbeat(self, frame: Frame, source: Source, custom_mode: int) -> None:
+        """Note the address of another program, which may be ours."""
+        now_ns = time.monotonic_ns()
+        if self._address.on_heartbeat(frame, source, custom_mode, now_ns) and source == self._source:
+            self._telemetry.on_shared_address(now_ns, commands=False)
+
+    def _commander_from(self, frame: Frame, source: Source, mav_type: int, custom_mode: int) -> None:
+        """Note another service on this vehicle, if the message is one's.
+
+        Only as the autopilot, or a router in its place, forwards it: else anybody who can send to this port
+        could prevent every flight.
+        """
+        if self._system_id is None or source != self._source:
+            return
         sender = (frame.system_id, frame.component_id)
-        # A heartbeat with the sequence number and content of one that we sent is our own, echoed.
-        echo = sender == self.own_address and (frame.sequence, custom_mode) in self._own_heartbeats
         commander = read_commander(mav_type, custom_mode, sender, time.monotonic_ns())
-        if commander is not None and frame.system_id == self._own_system_id and not echo:
+        is_ours = self._address.is_echo(frame, custom_mode)
+        if commander is not None and frame.system_id == self._own_system_id and not is_ours:
             self._telemetry.on_commander(commander)
 
     def _no_answer(self, text: str) -> NoAnswerError:
@@ -386,17 +454,23 @@ class AutopilotDriver(ABC):
         now_ns = time.monotonic_ns()
         boot_ns, sent_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
         # Older autopilots leave the target 0; our own stamp identifies the reply.
-        for_us = (system, component) in ((0, 0), (self._own_system_id, self._own_component_id))
+        for_us = (system, component) in ((0, 0), self.own_address)
         if boot_ns > 0 and for_us and sent_ns in self._timesyncs_ns:
             self._telemetry.answered_ns = max(self._telemetry.answered_ns, sent_ns)
+        elif boot_ns > 0 and (system, component) == self.own_address:
+            self._on_foreign_timesync(now_ns)
         if not (boot_ns > 0 and sent_ns == self._timesync_sent_ns and for_us):
             return
         self._telemetry.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
         if self._telemetry.clock.answer(sent_ns, boot_ns, now_ns):
             self._telemetry.state = replace(self._telemetry.state, clock=self._telemetry.clock.offset(now_ns))
 
+    def _on_foreign_timesync(self, now_ns: int) -> None:
+        if self._address.is_foreign_timesync(now_ns):
+            self._telemetry.on_shared_address(now_ns, commands=False)
+
     def _note_other(self, sender: tuple[Any, ...], text: str) -> None:
-        if sender not in self._others:
+        if sender not in self._others and len(self._others) < _MOST_OTHERS:
             self._others.add(sender)
             logger.info("%s: " + text, self.url, *sender)
 
@@ -464,13 +538,13 @@ class AutopilotDriver(ABC):
         sequence, self._sequence = self._sequence, (self._sequence + 1) & 0xFF
         return sequence
 
-    def _transmit_payload(self, message_id: int, payload: bytes) -> None:
+    def _transmit_payload(self, message_id: int, payload: bytes, component_id: int | None = None) -> None:
         self._transmit(
             pack_frame(
                 message_id,
                 payload,
                 system_id=self._own_system_id,
-                component_id=self._own_component_id,
+                component_id=self.own_address[1] if component_id is None else component_id,
                 sequence=self._next_sequence(),
             )
         )
@@ -482,11 +556,11 @@ class AutopilotDriver(ABC):
         own_uptime_s = (time.monotonic_ns() - self._started_ns) / 1e9
         mode = commander_mode(own_uptime_s if uptime_s is None else uptime_s, in_command)
         payload = _HEARTBEAT.pack(mode, ONBOARD_CONTROLLER, _AUTOPILOT_INVALID, 0, int(status), 3)
-        self._own_heartbeats.append((self._sequence, mode))
+        self._address.sent(self._sequence, mode)
         self._transmit_payload(HEARTBEAT_ID, payload)
         if self._autopilot_kind == ARDUPILOT:  # it keeps this heartbeat from another service with our address
             payload = _NAMED_VALUE_INT.pack(self._boot_ms(), mode, COMMANDER_NAME)
-            self._own_heartbeats.append((self._sequence, mode))
+            self._address.sent(self._sequence, mode)
             self._transmit_payload(_NAMED_VALUE_INT_ID, payload)
 
     def send_setpoint(self, setpoint: Setpoint) -> None:
@@ -528,12 +602,17 @@ class AutopilotDriver(ABC):
             raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         lock = self._command_locks.setdefault(command, asyncio.Lock())
         async with lock:
-            return await self._exchange_command(command, (*parameters, *[0.0] * (7 - len(parameters))))
+            try:
+                self._address.asked(command, time.monotonic_ns())
+                return await self._exchange_command(command, (*parameters, *[0.0] * (7 - len(parameters))))
+            finally:
+                self._address.asked(command, time.monotonic_ns())
 
     def _send_once(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         """Send a command that changes the mode: only `mode_changes` repeats it."""
         if self._link is None:
             raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
+        self._address.asked(command, time.monotonic_ns())
         self._send_command(command, (*parameters, *[0.0] * (7 - len(parameters))), confirmation)
 
     async def arm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
@@ -586,7 +665,7 @@ class AutopilotDriver(ABC):
     @property
     def own_address(self) -> Address:
         """See Driver."""
-        return (self._own_system_id, self._own_component_id)
+        return self._address.address
 
     async def find_gimbal(self) -> bool:
         """See Driver."""
@@ -607,7 +686,8 @@ class AutopilotDriver(ABC):
     def _ack_is_ours(self, fields: Fields) -> bool:
         """Whether a COMMAND_ACK is for us; MAVLink 1 and broadcasting autopilots leave the target 0."""
         target = (fields.get("target_system", 0), fields.get("target_component", 0))
-        return target[0] in (0, self._own_system_id) and target[1] in (0, self._own_component_id)
+        system, component = self.own_address
+        return target[0] in (0, system) and target[1] in (0, component)
 
     # --- link supervision ---------------------------------------------------------------------------
 

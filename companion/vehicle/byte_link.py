@@ -135,7 +135,8 @@ class _UdpLink:
             except OSError as error:  # ICMP port unreachable: nothing listens at the peer yet
                 logger.debug("%s: %s", self._url, error)
                 continue
-            self.received(data, source)
+            if not self._peer_is_fixed or source == self._peer:
+                self.received(data, source)
 
     def send(self, data: bytes) -> None:
         if self._peer is None or self._socket.fileno() < 0:

@@ -8,8 +8,9 @@ autopilot reads from an onboard controller:
     bit  19      in command now
     bits 18..0   uptime, seconds (at most 6 days)
 
-ArduPilot forwards no HEARTBEAT to a link from which it has received the same system and component id, and all
-services have the same. So the number is also sent as a NAMED_VALUE_INT, which is forwarded.
+Neither ArduPilot nor a MAVLink router forwards a HEARTBEAT to a link from which it has received the same
+system and component id. So each service has another component id (`companion.vehicle.own_address`). ArduPilot
+forwards a NAMED_VALUE_INT nevertheless, so the number is also sent to it as one.
 """
 
 from __future__ import annotations

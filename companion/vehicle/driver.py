@@ -155,7 +155,13 @@ class Driver(Protocol):
 
     @property
     def own_address(self) -> Address:
-        """System and component id of our messages."""
+        """System and component id of our messages; also in `state`."""
+
+    def change_address(self) -> bool:
+        """Send with another component id from now on, since another program has ours.
+
+        False: none is free, the gimbal is under our control, or the library does not allow it.
+        """
 
     async def find_gimbal(self) -> bool:
         """Request the gimbal manager's information and its streams. False: no answer. Never raises.

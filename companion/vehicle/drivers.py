@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal, get_args
 
 from companion.vehicle.driver import Driver, OnBytes
@@ -20,6 +21,7 @@ def open_driver(
     system_id: int | None = None,
     own_system_id: int = 1,
     own_component_id: int = 191,
+    other_component_ids: Sequence[int] = (),
     signing_key: bytes | None = None,
     range_finder_height: bool = False,
     on_bytes: OnBytes | None = None,
@@ -32,6 +34,8 @@ def open_driver(
         url: `udpin://HOST:PORT`, `udpout://HOST:PORT`, `tcp://HOST:PORT` or `serial:///dev/X:BAUD`.
         system_id: the autopilot's MAVLink system id; None: the first autopilot received.
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
+        other_component_ids: used instead where another program has our component id. With any, `connect`
+            waits for other programs' heartbeats, for up to 2 s after the link has opened.
         signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is accepted.
         range_finder_height: as in `VehicleState`.
         on_bytes: called in the loop with everything received and sent.
@@ -45,8 +49,9 @@ def open_driver(
     for name, number in (("system_id", system_id), ("own_system_id", own_system_id)):
         if number is not None and not 1 <= number <= 255:
             raise ValueError(f"{name} must be 1..255, got {number}")
-    if not 1 <= own_component_id <= 255:
-        raise ValueError(f"own_component_id must be 1..255, got {own_component_id}")
+    for number in (own_component_id, *other_component_ids):
+        if not 1 <= number <= 255:
+            raise ValueError(f"own_component_id must be 1..255, got {number}")
     link_url = parse_link_url(url)
 
     # Imported here: each library is slow to load, and one of them is enough.
@@ -64,6 +69,7 @@ def open_driver(
         system_id=system_id,
         own_system_id=own_system_id,
         own_component_id=own_component_id,
+        other_component_ids=other_component_ids,
         signing_key=signing_key,
         range_finder_height=range_finder_height,
         on_bytes=on_bytes,

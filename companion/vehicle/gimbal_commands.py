@@ -12,7 +12,7 @@ import math
 from collections.abc import Awaitable, Callable
 
 from companion.vehicle.driver import CommandRefusedError
-from companion.vehicle.gimbal import Address, GimbalAim, YawFrame
+from companion.vehicle.gimbal import GimbalAim, YawFrame
 from companion.vehicle.mav_result import ACCEPTED, result_name
 from companion.vehicle.telemetry_state import TelemetryState
 
@@ -43,7 +43,6 @@ class GimbalCommands:
     Args:
         url: of the link, for messages. telemetry: the autopilot's state.
         command: sends one command with its parameters and returns the MAV_RESULT.
-        own_address: system and component id of our commands.
     """
 
     def __init__(
@@ -51,10 +50,8 @@ class GimbalCommands:
         url: object,
         telemetry: TelemetryState,
         command: Callable[..., Awaitable[int]],
-        own_address: Address,
     ) -> None:
         self._url, self._telemetry, self._command = url, telemetry, command
-        self._own_address = own_address
         self._finding = asyncio.Lock()
         self._search_requested = False
 
@@ -103,7 +100,7 @@ class GimbalCommands:
 
     async def take_control(self) -> None:
         """Take primary control. Raises CommandRefusedError."""
-        system, component = self._own_address
+        system, component = self._telemetry.state.own_address
         await self._send_command(
             "control of the gimbal", CONFIGURE, float(system), float(component), UNCHANGED, UNCHANGED
         )

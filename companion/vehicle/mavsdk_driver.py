@@ -65,7 +65,7 @@ class MavsdkDriver(AutopilotDriver):
         self._loop = asyncio.get_running_loop()
         self._awaited: set[asyncio.Future[Any]] = set()
         self._blocking = ThreadPoolExecutor(1, thread_name_prefix="mavsdk-driver")
-        configuration = mavsdk.Configuration.create_manual(self._own_system_id, self._own_component_id, False)
+        configuration = mavsdk.Configuration.create_manual(*self.own_address, False)
         self._mavsdk = mavsdk.Mavsdk(configuration)
         configuration.destroy()
         self._mavsdk.subscribe_raw_bytes_to_be_sent(self._library_sends)  # first: else it logs an error
@@ -86,6 +86,10 @@ class MavsdkDriver(AutopilotDriver):
             logger.warning("%s: with this MAVSDK, closing during a command may crash", self.url)
         self._parameters = Param(system)
         self._direct = direct
+
+    @property
+    def _can_change_address(self) -> bool:
+        return self._mavsdk is None  # it is fixed when the library starts
 
     async def _detach(self) -> None:
         library, self._mavsdk = self._mavsdk, None
@@ -121,7 +125,7 @@ class MavsdkDriver(AutopilotDriver):
         for frame in frames_of(data):
             # Renumbered, so that the vehicle does not count the dropped heartbeats as lost.
             if frame.message_id != HEARTBEAT_ID:
-                own = frame.component_id == self._own_component_id
+                own = frame.component_id == self.own_address[1]
                 self._transmit(with_sequence(frame, self._next_sequence()) if own else frame.raw)
 
     def _on_frames(self, frames: list[Frame]) -> None:
@@ -155,7 +159,7 @@ class MavsdkDriver(AutopilotDriver):
         return MavlinkMessage(
             message_name=name,
             system_id=self._own_system_id,
-            component_id=self._own_component_id,
+            component_id=self.own_address[1],
             target_system_id=self._system_id,
             target_component_id=AUTOPILOT_COMPONENT,
             fields_json=json.dumps(fields, allow_nan=False),

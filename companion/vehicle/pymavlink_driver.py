@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import logging
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -65,6 +65,7 @@ class PymavlinkDriver(AutopilotDriver):
         system_id: int | None,
         own_system_id: int,
         own_component_id: int,
+        other_component_ids: Sequence[int] = (),
         signing_key: bytes | None = None,
         range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
@@ -74,6 +75,7 @@ class PymavlinkDriver(AutopilotDriver):
             system_id=system_id,
             own_system_id=own_system_id,
             own_component_id=own_component_id,
+            other_component_ids=other_component_ids,
             signing_key=signing_key,
             range_finder_height=range_finder_height,
             on_bytes=on_bytes,
@@ -113,7 +115,7 @@ class PymavlinkDriver(AutopilotDriver):
 
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
-        self._codec.seq = self._next_sequence()
+        self._codec.seq, self._codec.srcComponent = self._next_sequence(), self.own_address[1]
         self._transmit(bytes(definition(**fields).pack(self._codec)))
 
     # --- commands -----------------------------------------------------------------------------------

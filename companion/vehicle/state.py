@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.commander import Commander
-from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.gimbal import Address, GimbalState
 from companion.vehicle.ground import GROUND_MAX_AGE_S, GroundLevel
 from companion.vehicle.report import WARNING, Report
 from companion.vehicle.vehicle_type import AUTOPILOT_NAMES, VtolState, autopilot_text, why_not_flown
@@ -138,6 +138,9 @@ class VehicleState:
         vtol_state: None until EXTENDED_SYS_STATE is received.
         missing_streams: names of required messages received below half of their rate.
         other_commanders: other companion services received on the link, of any age.
+        own_address: system and component id of our messages.
+        address_shared_ns: when another program last sent with our address, as far as known.
+        foreign_command_ns: when the autopilot last acknowledged, to our address, a motion command of another.
     """
 
     heartbeat_ns: int = 0
@@ -183,6 +186,9 @@ class VehicleState:
     vtol_state: VtolState | None = None
     missing_streams: tuple[str, ...] = ()
     other_commanders: tuple[Commander, ...] = ()
+    own_address: Address = (1, 191)
+    address_shared_ns: int = 0
+    foreign_command_ns: int = 0
 
     @property
     def yaw_rad(self) -> float | None:

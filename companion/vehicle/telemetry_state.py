@@ -13,6 +13,7 @@ from dataclasses import replace
 from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
 from companion.vehicle.clock_sync import ClockSync
 from companion.vehicle.commander import Commander
+from companion.vehicle.gimbal import Address
 from companion.vehicle.gimbal_telemetry import ATTITUDE_STATUS, from_gimbal_device
 from companion.vehicle.report import Report
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, VehicleState
@@ -38,7 +39,7 @@ class TelemetryState:
 
     Args:
         url: of the link, for the log. on_two_autopilots: called when two autopilots send with one id.
-        range_finder_height: as in `VehicleState`.
+        own_address, range_finder_height: as in `VehicleState`.
 
     Attributes:
         state: the newest snapshot.
@@ -51,17 +52,23 @@ class TelemetryState:
     """
 
     def __init__(
-        self, url: object, on_two_autopilots: Callable[[], None], range_finder_height: bool = False
+        self,
+        url: object,
+        on_two_autopilots: Callable[[], None],
+        range_finder_height: bool = False,
+        own_address: Address = VehicleState.own_address,
     ) -> None:
         self._url, self._on_two_autopilots = url, on_two_autopilots
-        self._range_finder_height = range_finder_height
+        self._own_address, self._range_finder_height = own_address, range_finder_height
         self._subscribers: dict[object, Callable[[VehicleState], None]] = {}
         self._watchers: dict[object, Callable[[str, Fields], None]] = {}
         self.reset()
 
     def reset(self) -> None:
         """Reset to the state before the first message."""
-        self.state = VehicleState(range_finder_height=self._range_finder_height)
+        self.state = VehicleState(
+            range_finder_height=self._range_finder_height, own_address=self._own_address
+        )
         self.profile: AutopilotProfile = Px4Profile()
         self.clock = ClockSync()
         self.mode_ns = 0
@@ -127,6 +134,18 @@ class TelemetryState:
         """Note a heartbeat of another service on the same vehicle."""
         others = (other for other in self.state.other_commanders if other.address != commander.address)
         self._publish(replace(self.state, other_commanders=(*others, commander)), "COMMANDER", {})
+
+    def on_shared_address(self, now_ns: int, *, commands: bool) -> None:
+        """Note that another program uses our address; `commands`: it has moved the vehicle."""
+        state = replace(self.state, address_shared_ns=now_ns)
+        if commands:
+            state = replace(state, foreign_command_ns=now_ns)
+        self._publish(state, "COMMANDER", {})
+
+    def use_address(self, own_address: Address) -> None:
+        """From now on our messages have this address."""
+        self._own_address = own_address
+        self._publish(replace(self.state, own_address=own_address, address_shared_ns=0), "COMMANDER", {})
 
     def _publish(self, state: VehicleState, name: str, fields: Fields) -> None:
         """Set the state after a message, and notify watchers and subscribers."""

@@ -43,7 +43,7 @@ class LiveFlight:
         self.driver = driver_of(settings)
         self.streamer = Streamer(self.driver.send_setpoint, clock_ns=self.driver.watch.now_ns)
         self.events: list[tuple[str, str]] = []
-        self.guidance = Guidance(guidance_options(settings, self.driver.own_address))
+        self.guidance = Guidance(guidance_options(settings))
         self.inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], self._event)
         started_ns = time.monotonic_ns() - round(ran_s * 1e9)
         self.others = OtherCommanders(settings.vehicle, "here", started_ns, self._event)

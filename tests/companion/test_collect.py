@@ -164,7 +164,7 @@ def recorded(folder: Path, **changes: str) -> Path:
         for one in converter.convert(path, payload, attachment):
             writer.write(*one)
 
-    write("@record/run", dumps(run_record(settings, GuidanceOptions(), (1, 191), "service1")))
+    write("@record/run", dumps(run_record(settings, GuidanceOptions(), "service1")))
     for frame in doubtful(20):
         about = {"captured_ns": frame.captured_ns, "sequence": frame.message["sequence"]}
         tracks = [{**one, "confidence": 0.5} for one in frame.message["detections"]]

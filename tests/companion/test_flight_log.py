@@ -43,7 +43,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for converted in converter.convert(path, payload, attachment):
             writer.write(*converted)
 
-    write("@record/run", run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1"))
+    write("@record/run", run_record(plain_settings(), GuidanceOptions(), "service1"))
     state = VehicleState(mode=FlightMode.HOLD)
     for second in range(11):
         armed = 3 <= second < 7

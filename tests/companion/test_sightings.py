@@ -52,7 +52,7 @@ def event(
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording in which a car is seen twice, a person without a range, and a bus by a second camera."""
     writer, converter = new_writer(tmp_path_factory.mktemp("sightings")), Converter("vehicle1")
-    run = run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1")
+    run = run_record(plain_settings(), GuidanceOptions(), "service1")
     messages: list[tuple[str, dict[str, Any]]] = [
         ("@record/run", run | {"unix_offset_ns": BEGAN_NS}),
         ("tracks", {"published_ns": 3 * SECOND_NS, "events": [event(1, 2, 3, (47.0, 8.0))]}),

@@ -69,17 +69,15 @@ class GimbalRequest:
 class GimbalControl:
     """One client of one gimbal manager.
 
-    Args:
-        own: system and component id of our messages.
-
     Attributes:
+        own: system and component id of our messages.
         held: we have primary control, as far as known.
         pointed: the newest accepted aim of the current owner; None: none yet.
         problem: why the gimbal is not moved any more for the current owner; empty: no problem.
     """
 
-    def __init__(self, own: Address) -> None:
-        self._own = own
+    def __init__(self) -> None:
+        self.own: Address = VehicleState.own_address
         self.held = False
         self.pointed: GimbalAim | None = None
         self.problem = ""
@@ -95,7 +93,7 @@ class GimbalControl:
     def other_owner(self, gimbal: GimbalState | None) -> Address | None:
         """The component in control that must not be displaced; None: none known."""
         primary = None if gimbal is None else gimbal.primary_control
-        free = (None, NOBODY, self._own, (self._own[0], AUTOPILOT_COMPONENT))
+        free = (None, NOBODY, self.own, (self.own[0], AUTOPILOT_COMPONENT))
         return None if primary in free else primary
 
     def holds(self, now_ns: int, gimbal: GimbalState | None) -> bool:
@@ -113,7 +111,7 @@ class GimbalControl:
         """
         if owner is not self._owner:
             self._owner, self.problem, self.pointed = owner, "", None
-        if gimbal is not None and gimbal.status_ns > self._taken_ns and gimbal.primary_control == self._own:
+        if gimbal is not None and gimbal.status_ns > self._taken_ns and gimbal.primary_control == self.own:
             self._shown = True
         if self.held and (why := self._taken_over(now_ns, gimbal)) is not None:
             self.held = False
@@ -174,7 +172,7 @@ class GimbalControl:
         if gimbal is None or gimbal.primary_control is None or gimbal.status_ns <= self._taken_ns:
             return None
         primary = gimbal.primary_control
-        if primary == self._own:
+        if primary == self.own:
             return None
         waiting = now_ns - self._taken_ns <= SHOWN_WITHIN_S * 1e9
         if not self._shown and primary == self._taken_from and waiting:
@@ -195,7 +193,7 @@ class GimbalControl:
         if self._unsure(now_ns, gimbal):
             return False
         shown = gimbal is not None and gimbal.status_ns > self._doubted_ns
-        self.held = shown and gimbal is not None and gimbal.primary_control == self._own
+        self.held = shown and gimbal is not None and gimbal.primary_control == self.own
         return self.held and now_ns >= self._give_back_due_ns
 
     def _unsure(self, now_ns: int, gimbal: GimbalState | None) -> bool:
@@ -240,16 +238,13 @@ class _PointRequest:
 class GimbalController:
     """One gimbal's controller; every method is called from `Guidance.step`.
 
-    Args:
-        own: system and component id of our messages.
-
     Attributes:
         mounting: may be replaced after the start: a camera can provide its own mount.
     """
 
-    def __init__(self, own: Address, mounting: GimbalMounting) -> None:
+    def __init__(self, mounting: GimbalMounting) -> None:
         self.mounting = mounting
-        self._control = GimbalControl(own)
+        self._control = GimbalControl()
         self._asked: tuple[int, GimbalCommand, int] | None = None
         self._find: int | None = None
         self._not_found = False
@@ -265,7 +260,8 @@ class GimbalController:
     # --- status -------------------------------------------------------------------------------------------
 
     def snapshot(self, now_ns: int, state: VehicleState) -> GimbalStatus:
-        """The gimbal's control and mounting for behaviours."""
+        """The gimbal's control and mounting for behaviours. Called first in every step."""
+        self._control.own = state.own_address
         owner = self._control.other_owner(state.gimbal)
         fault = ""
         if self.mounting.carries_steering:

@@ -81,7 +81,7 @@ class ScriptedGimbal:
         """Execute a request; returns why it is refused."""
         match action:
             case TakeGimbal():
-                self.primary = GuidanceOptions().own_address
+                self.primary = VehicleState.own_address
             case ReleaseGimbal():
                 self.primary = NOBODY
             case PointGimbal(aim):

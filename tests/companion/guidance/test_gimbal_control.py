@@ -24,7 +24,7 @@ class Bench:
     """A manager with a configurable status, stepped every 0.1 s."""
 
     def __init__(self, primary: tuple[int, int] | None = NOBODY) -> None:
-        self.control = GimbalControl(OURS)
+        self.control = GimbalControl()
         self.now_ns = 10_000_000_000
         self.gimbal = GimbalState(device=1, primary_control=primary, status_ns=self.now_ns)
 
@@ -218,7 +218,7 @@ def test_control_with_a_lost_answer_is_released() -> None:
 
 
 def test_control_is_not_taken_while_the_owner_is_unknown() -> None:
-    control = GimbalControl(OURS)
+    control = GimbalControl()
     assert control.update(1, None, DOWN, SEEK) is None
     assert UNKNOWN_OWNER in control.problem
 

@@ -35,7 +35,7 @@ class ControllerHarness:
     """A controller stepped every 50 ms; requests are answered at the next step, refused as in `refuse`."""
 
     def __init__(self, mounting: GimbalMounting = GimbalMounting()) -> None:  # noqa: B008 - frozen
-        self.controller = GimbalController(OWN, mounting)
+        self.controller = GimbalController(mounting)
         self.out = OutputCollector()
         self.vehicle = KinematicVehicle()
         self.began_ns = self.vehicle.now_ns

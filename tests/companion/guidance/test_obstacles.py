@@ -136,7 +136,7 @@ def test_stale_depth_brakes_with_its_age() -> None:
 
 def test_depth_age_follows_perception_max_age_s() -> None:
     settings = load_settings("/dev/null", {"guidance.perception_max_age_s": "1.5"}, environment={})
-    assert guidance_options(settings, (1, 191)).obstacles.max_age_s == 1.5
+    assert guidance_options(settings).obstacles.max_age_s == 1.5
 
 
 @pytest.mark.parametrize("send", [True, False])

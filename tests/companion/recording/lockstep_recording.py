@@ -55,7 +55,7 @@ def recording(
         images: `.png` or `.jpg`: also the rendered camera's images, depth and detections. model: its model.
     """
     writer, original = new_writer(folder), flight.guidance.step
-    run = run_record(flight.settings, flight.guidance.options, (1, 191), "service1")
+    run = run_record(flight.settings, flight.guidance.options, "service1")
     writer.write(Channel(RUN_CHANNEL, "companion.run", ANY_OBJECT), flight.now_ns, dumps(run))
     converter = Converter("vehicle1")
     list(converter.convert(RUN.name, dumps(run)))

@@ -70,7 +70,7 @@ def converter() -> Converter:
     """Of a service whose preview is half as wide as the frames."""
     converter = Converter("vehicle1")
     settings = plain_settings({"preview.width": "960"})
-    run = run_record(settings, GuidanceOptions(), (1, 191), "service1")
+    run = run_record(settings, GuidanceOptions(), "service1")
     assert [message.channel.topic for message in converter.convert("@record/run", dumps(run))] == ["run"]
     return converter
 

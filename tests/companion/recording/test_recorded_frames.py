@@ -34,7 +34,7 @@ def part(folder: Path, *messages: tuple[str, int], depth: Mapping[str, object] |
     """
     folder.mkdir()
     writer = new_writer(folder)
-    about = run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1") | {"unix_offset_ns": 0}
+    about = run_record(plain_settings(), GuidanceOptions(), "service1") | {"unix_offset_ns": 0}
     writer.write(Channel(RUN_CHANNEL, "companion.run", ANY_OBJECT), 1, json.dumps(about).encode())
     body: dict[str, object]
     for kind, second in messages:

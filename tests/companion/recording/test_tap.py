@@ -123,7 +123,7 @@ def test_step_that_cannot_be_encoded_is_left_out(caplog: Any) -> None:
 
 def test_recorded_settings_are_valid_and_have_no_source() -> None:
     keys = {"source.uri": "rtsp://user:secret@host/a", "cameras.down.source.uri": "/dev/video2"}
-    run = run_record(plain_settings(keys), GuidanceOptions(), (1, 191), "service1")
+    run = run_record(plain_settings(keys), GuidanceOptions(), "service1")
     assert "secret" not in json.dumps(run)
     settings = Settings.from_json(json.loads(json.dumps(run["settings"])))
     assert list(settings.cameras) == ["down"]

@@ -79,7 +79,7 @@ def link_pieces(flight: Flight, *, answers: bool = True) -> list[LinkBytes]:
 def write_recording(folder: Path, pieces: Sequence[LinkBytes]) -> tuple[Path, int]:
     """Returns the file, and Unix time minus CLOCK_MONOTONIC in it."""
     writer, converter = new_writer(folder), Converter("vehicle1")
-    run = run_record(plain_settings(), GuidanceOptions(), (1, 191), "service1")
+    run = run_record(plain_settings(), GuidanceOptions(), "service1")
     offset_ns = run["unix_offset_ns"]
     for message in converter.convert("@record/run", dumps(run)):
         writer.write(message.channel, BEGIN_NS + offset_ns, message.data)

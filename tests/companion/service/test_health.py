@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
@@ -37,6 +38,7 @@ class FakeDriver:
         self.link_count = 1
         self.on_read: Callable[[], object] = lambda: None
         self._parameters, self._version = parameters, version
+        self.changes = 0
 
     async def firmware_version(self) -> FirmwareVersion:
         if self._version is None:
@@ -49,12 +51,16 @@ class FakeDriver:
             raise CommandRefusedError(f"parameter {name}: no answer")
         return self._parameters[name]
 
+    def change_address(self) -> bool:
+        self.changes += 1
+        return True
+
     def send_heartbeat(self, *_: Any, **__: Any) -> None:
         pass
 
 
 def guidance() -> Guidance:
-    return Guidance(guidance_options(plain_settings(), (1, 191)))
+    return Guidance(guidance_options(plain_settings()))
 
 
 def health_of(
@@ -233,6 +239,16 @@ async def test_answers_of_an_earlier_link_are_not_used() -> None:
     driver.on_read = lambda: setattr(driver, "link_count", 2)
     await health.check()
     assert inputs.parameters is NOTHING_READ
+
+
+@pytest.mark.parametrize("in_command", [False, True])
+def test_shared_address_is_changed_only_while_not_in_command(in_command: bool) -> None:
+    health, driver, _, _ = health_of("PX4", {}, None)
+    health.after_step(0, guidance())
+    assert driver.changes == 0
+    driver.state = VehicleState(address_shared_ns=1)
+    health.after_step(10**9, cast(Guidance, SimpleNamespace(in_command=in_command, status="")))
+    assert driver.changes == (0 if in_command else 1)
 
 
 async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:

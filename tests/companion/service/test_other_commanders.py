@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import CommandInput
-from companion.service.other_commanders import OtherCommanders
+from companion.service.other_commanders import FOREIGN_OFFBOARD, OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.commander import Commander
 from companion.vehicle.state import FlightMode, VehicleState
@@ -125,6 +126,68 @@ def test_appearance_and_loss_are_reported_once() -> None:
     for second in range(4, 7):
         here.watch(beside(200.0, age_s=0.0), NOW_NS + second * S)
     assert [level for level, _ in here.events] == ["error", "info"]
+
+
+def offboard(now_ns: int, **changes: Any) -> VehicleState:
+    """PX4 in the air that flies setpoints."""
+    state = VehicleState(autopilot="PX4", mode=FlightMode.OFFBOARD, armed=True, heartbeat_ns=now_ns)
+    return replace(state, **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "in_command", "noticed"),
+    [
+        ({}, False, True),
+        ({}, True, False),  # ours
+        ({"armed": False}, False, False),  # PX4 shows it after a landing
+        ({"mode": FlightMode.HOLD}, False, False),
+        ({"autopilot": "ArduPilot"}, False, False),  # it stays in GUIDED without setpoints
+    ],
+)
+def test_setpoints_of_another_program_are_noticed_on_px4(
+    changes: dict[str, Any], in_command: bool, noticed: bool
+) -> None:
+    here = Here()
+    for second in range(7):
+        now_ns = NOW_NS + second * S
+        state = offboard(now_ns, **changes)
+        here.watch(state, now_ns, in_command=in_command)
+        if second < 5:  # PX4 leaves OFFBOARD some time after our own last setpoint
+            assert here.present(state, now_ns) == []
+    found = [(other.identity, other.in_command) for other in here.present(state, now_ns)]
+    assert found == ([(FOREIGN_OFFBOARD, True)] if noticed else [])
+    assert [level for level, _ in here.events] == (["error"] if noticed else [])
+    command = CommandInput(1, "hold", HoldBehaviour())
+    refused = here.check_requirements(command, state, in_command=False, now_ns=now_ns)
+    assert (refused is not None) is noticed
+
+
+def test_brief_offboard_of_ours_is_no_other_commander() -> None:
+    here = Here()
+    for second in range(20):
+        now_ns = NOW_NS + second * S
+        here.watch(offboard(now_ns), now_ns, in_command=second % 4 == 0)
+        assert here.present(offboard(now_ns), now_ns) == []
+
+
+def test_command_with_our_address_refuses_until_it_is_over() -> None:
+    here = Here()
+    state = VehicleState(foreign_command_ns=NOW_NS - S, address_shared_ns=NOW_NS - S)
+    assert here.reason(state) is not None
+    assert here.reason(state, StopBehaviour()) is None
+    assert here.reason(VehicleState(foreign_command_ns=NOW_NS - 4 * S)) is None
+
+
+def test_shared_and_changed_address_are_reported_once() -> None:
+    here = Here()
+    for second in range(3):
+        here.watch(VehicleState(address_shared_ns=NOW_NS), NOW_NS + second * S, in_command=True)
+    assert [level for level, _ in here.events] == ["error"]
+    for second in range(3):
+        here.watch(VehicleState(own_address=(1, 193)), NOW_NS + second * S)
+    assert [level for level, _ in here.events] == ["error", "warning"]
+    assert "1/191" in here.events[1][1]
+    assert "1/193" in here.events[1][1]
 
 
 @pytest.mark.realtime

@@ -33,7 +33,7 @@ class FakeAutopilot:
     def __init__(self, port: int, *, system_id: int = 1, component_id: int = 1, autopilot: int = 12) -> None:
         self.received: list[tuple[Any, bytes]] = []
         self.answers: dict[str, Callable[[Any], None]] = {
-            "COMMAND_LONG": lambda m: self.acknowledge(m.command),
+            "COMMAND_LONG": lambda m: self.acknowledge(m.command, to=sender_of(m)),
             "TIMESYNC": lambda m: self.send(mavlink.MAVLink_timesync_message(time.monotonic_ns(), m.ts1)),
         }
         self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
@@ -67,8 +67,8 @@ class FakeAutopilot:
     def landed(self, landed_state: int = 1) -> None:
         self.send(mavlink.MAVLink_extended_sys_state_message(self.vtol_state, landed_state))
 
-    def acknowledge(self, command: int, result: int = 0) -> None:
-        self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, 1, 191))
+    def acknowledge(self, command: int, result: int = 0, *, to: tuple[int, int] = (1, 191)) -> None:
+        self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, *to))
 
     def home(self, altitude_amsl_m: float = 488.0) -> None:
         altitude = round(altitude_amsl_m * 1000)
@@ -122,6 +122,11 @@ class FakeAutopilot:
         await wait_until(
             lambda: command in commands(), timeout_s, lambda: f"command {command}, not {commands()}"
         )
+
+
+def sender_of(message: Any) -> tuple[int, int]:
+    """System and component id of a received message."""
+    return (message.get_srcSystem(), message.get_srcComponent())
 
 
 async def wait_until(

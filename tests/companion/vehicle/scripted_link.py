@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.byte_link import Received, Source
-from companion.vehicle.driver import OnBytes
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import Frame, frames_of
 
@@ -46,8 +46,8 @@ class ScriptedDriver:
         driver: the driver. link: its link.
     """
 
-    def __init__(self, kind: DriverKind, on_bytes: OnBytes | None = None) -> None:
-        driver = open_driver(kind, "udpin://127.0.0.1:14540", on_bytes=on_bytes)
+    def __init__(self, kind: DriverKind, *, other_component_ids: Sequence[int] = ()) -> None:
+        driver = open_driver(kind, "udpin://127.0.0.1:14540", other_component_ids=other_component_ids)
         assert isinstance(driver, AutopilotDriver)
         self.driver, self.link = driver, ScriptedLink()
         driver._link = self.link
