@@ -23,7 +23,7 @@ from tests.companion.vehicle.test_commander import heartbeat, named_value
 
 S = 1_000_000_000
 OTHERS = (192, 193, 194)
-STRANGER = ("127.0.0.1", 4711)
+OTHER_SENDER = ("127.0.0.1", 4711)
 MARK = commander_mode(100.0, True)
 
 
@@ -51,7 +51,7 @@ def test_changed_id_is_one_that_nobody_uses(
     address = OwnAddress(1, own, others)
     now_ns = 100 * S
     for component, from_autopilot, age_s in received:
-        source = AUTOPILOT if from_autopilot else STRANGER
+        source = AUTOPILOT if from_autopilot else OTHER_SENDER
         address.on_heartbeat(frame_of((1, component)), source, MARK, now_ns - age_s * S)
     address.only_from(AUTOPILOT)
     last = {component: age for component, near, age in received if near}  # in the order of arrival
@@ -203,7 +203,7 @@ def test_acknowledgement_not_asked_for_is_another_commander(
     command: int, to: tuple[int, int], shared: bool
 ) -> None:
     one = scripted()
-    one.receive(acknowledgement(command, to), source=STRANGER)
+    one.receive(acknowledgement(command, to), source=OTHER_SENDER)
     assert one.driver.state.foreign_command_ns == 0
     one.receive(acknowledgement(command, to))
     assert (one.driver.state.foreign_command_ns > 0) is shared
@@ -246,10 +246,10 @@ def timesync(stamp_ns: int, to: tuple[int, int]) -> bytes:
 # --- only the autopilot's link ------------------------------------------------------------------------------
 
 
-def test_marks_of_a_stranger_are_ignored(kind: DriverKind) -> None:
+def test_marks_of_other_senders_are_ignored(kind: DriverKind) -> None:
     one = scripted(kind)
     for data in (heartbeat((1, 191), ONBOARD_CONTROLLER, MARK), named_value((1, 192), MARK)):
-        one.driver._received(data, STRANGER)
+        one.driver._received(data, OTHER_SENDER)
     assert commanders(one) == []
     assert one.driver.state.address_shared_ns == 0
     assert one.driver.change_address()
@@ -260,8 +260,8 @@ def test_marks_of_a_stranger_are_ignored(kind: DriverKind) -> None:
 
 def test_marks_before_the_first_autopilot_are_ignored() -> None:
     one = ScriptedDriver("pymavlink")
-    one.driver._received(heartbeat((1, 192), ONBOARD_CONTROLLER, MARK), STRANGER)
-    one.driver._received(named_value((1, 192), MARK), STRANGER)
+    one.driver._received(heartbeat((1, 192), ONBOARD_CONTROLLER, MARK), OTHER_SENDER)
+    one.driver._received(named_value((1, 192), MARK), OTHER_SENDER)
     assert commanders(one) == []
 
 
@@ -288,7 +288,7 @@ EVERY_MESSAGE = st.sampled_from(
 
 
 @given(messages=st.lists(EVERY_MESSAGE, max_size=30))
-def test_nothing_of_a_stranger_changes_the_state(messages: list[bytes]) -> None:
+def test_nothing_of_other_senders_changes_the_state(messages: list[bytes]) -> None:
     one = scripted()
     before = one.driver.state
     for number, data in enumerate(messages):
@@ -306,19 +306,19 @@ def test_senders_that_are_noted_are_limited() -> None:
 
 
 async def test_udpout_receives_from_its_peer_only(port: int) -> None:
-    vehicle, stranger = FakeAutopilot(port), FakeAutopilot(port)
+    vehicle, other = FakeAutopilot(port), FakeAutopilot(port)
     vehicle.sends_heartbeats = False
     vehicle.answers["HEARTBEAT"] = lambda _: setattr(vehicle, "sends_heartbeats", True)
     vehicle.start()
     driver = open_driver("pymavlink", f"udpout://127.0.0.1:{vehicle.socket.getsockname()[1]}")
     try:
         await driver.connect(10.0)
-        stranger._port = vehicle._port
-        stranger.send_bytes(heartbeat((1, 193), ONBOARD_CONTROLLER, MARK))
+        other._port = vehicle._port
+        other.send_bytes(heartbeat((1, 193), ONBOARD_CONTROLLER, MARK))
         vehicle.send_bytes(heartbeat((1, 194), ONBOARD_CONTROLLER, MARK))
         state = await wait_for_state(driver, lambda state: bool(state.other_commanders))
         assert [other.address for other in state.other_commanders] == [(1, 194)]
     finally:
         await driver.close()
         await vehicle.stop()
-        await stranger.stop()
+        await other.stop()
