@@ -31,7 +31,7 @@ from companion.settings import CameraSection, Settings
 from companion.vehicle.autopilot_parameters import NOTHING_READ
 from companion.vehicle.px4_modes import among_modes
 from companion.vehicle.report import Report
-from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.state import FlightMode, VehicleState
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected
 
@@ -94,9 +94,8 @@ class InputAssembler:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
         self._state = state
-        in_flight = state.armed and state.landed is not LandedState.ON_GROUND
         for camera in self._cameras.values():
-            camera.in_flight = in_flight
+            camera.in_flight = state.in_flight
         self.history.add(state)
 
     def _log_reports(self, state: VehicleState) -> None:
@@ -113,20 +112,15 @@ class InputAssembler:
             self._logged_ns.clear()
 
     def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
-        """Process a camera's result; returns its markers if marker detection is on.
-
-        In flight an image that was seen before is no new frame: nothing that it shows is used, and what the
-        first of the identical images showed grows old.
-        """
-        markers = None
+        """Process a camera's result, unless it repeats one; returns its markers if marker detection is on."""
         self._freezes.update(camera, result.captured_ns)
         if camera.repeats:
             return None
-        if result.markers is not None:
-            markers = self._markers.localize(camera, result, self.history, self._state)
         if camera is self.steering:
             camera.localize(result, self.history)
-        return markers
+        if result.markers is None:
+            return None
+        return self._markers.localize(camera, result, self.history, self._state)
 
     def assemble(
         self,

@@ -199,6 +199,11 @@ class VehicleState:
         return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
     @property
+    def in_flight(self) -> bool:
+        """Armed, and not known to be on the ground."""
+        return self.armed and self.landed is not LandedState.ON_GROUND
+
+    @property
     def altitude_m(self) -> float | None:
         """Height above home (above the local origin while home is unknown), metres, up positive."""
         if self.position_ned_m is None:
