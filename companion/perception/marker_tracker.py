@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
 from companion.guidance.targets.from_map import (
@@ -39,7 +40,7 @@ from vision.pipeline import PerceptionResult
 MAX_VISION_HZ = 50.0
 # A marker whose position changes by more between two frames begins again: metres, or three sigma of both.
 CONFIRM_DISTANCE_M = 1.0
-# Shortest time between two events about dropped positions.
+# Shortest time between two events about contradictions.
 EVENT_INTERVAL_S = 1.0
 
 
@@ -106,6 +107,7 @@ class MarkerTracker:
                 self._resolvers[camera.name],
             )
             targets = self._confirmed(camera.name, targets)
+            self._check_pads(camera, targets)
             boards = board_targets(result.boards, result.captured_ns, mount, history)
             if camera.name in self._maps and state is not None:
                 confirmed = {target.identifier for target in targets if target.confirmed}
@@ -174,23 +176,33 @@ class MarkerTracker:
         self, camera: PerceptionCamera, captured_ns: int, used: set[int], words: str, turned: bool
     ) -> None:
         """Publish why a position was dropped. `turned`: as if the prints were turned by 180 degrees."""
-        if captured_ns - self._event_ns < EVENT_INTERVAL_S * 1e9:
-            return
-        self._event_ns = captured_ns
-        section = camera.settings.markers
-        printed = self._maps[camera.name].print or section.print
-        cause = "check markers.map_file and the markers' sizes"
-        if turned and is_apriltag(section.dictionary or ""):
-            other = "apriltag" if printed == "opencv" else "opencv"
-            cause = (
-                "AprilRobotics' prints are turned by 180 degrees against OpenCV's: if these are "
-                f'{other}\'s, set markers.print = "{other}"; else check markers.map_file'
-            )
-        self._on_event(
-            "warning",
-            f"markers: position from the map dropped, {words} "
-            f"(markers {', '.join(map(str, sorted(used)))}; {self.vision_dropped} dropped so far): {cause}",
+        text = (
+            f"position from the map dropped, {words} "
+            f"(markers {', '.join(map(str, sorted(used)))}; {self.vision_dropped} dropped so far)"
         )
+        printed = self._maps[camera.name].print or camera.settings.markers.print
+        checked = "markers.map_file and the markers' sizes"
+        self._warn(captured_ns, text, _cause(camera, printed, checked, turned))
+
+    def _check_pads(self, camera: PerceptionCamera, targets: Sequence[MarkerTarget]) -> None:
+        """Publish that two markers of a pad disagree about its centre, as they do with turned prints."""
+        for one, other in combinations([target for target in targets if target.confirmed], 2):
+            apart_m = math.dist(one.pad_ned_m, other.pad_ned_m)
+            # With turned prints, twice the distance between the two.
+            between_m = math.dist(one.position_ned_m, other.position_ned_m)
+            allowed_m = max(between_m, 3.0 * math.hypot(one.range_sigma_m, other.range_sigma_m))
+            if one.pad == other.pad and apart_m > allowed_m:
+                text = (
+                    f"{one.identifier} and {other.identifier} disagree by {apart_m:.1f} m "
+                    f"about the centre of pad {one.pad}"
+                )
+                cause = _cause(camera, camera.settings.markers.print, "markers.others", True)
+                self._warn(one.captured_ns, text, cause)
+
+    def _warn(self, captured_ns: int, text: str, cause: str) -> None:
+        if captured_ns - self._event_ns >= EVENT_INTERVAL_S * 1e9:
+            self._event_ns = captured_ns
+            self._on_event("warning", f"markers: {text}: {cause}")
 
     def _confirmed(self, camera: str | None, targets: tuple[MarkerTarget, ...]) -> tuple[MarkerTarget, ...]:
         """The markers of one processed frame, `confirmed` where the frames before show them at that position.
@@ -253,6 +265,17 @@ class MarkerTracker:
             for camera in self._detecting
         )
         return f"a camera that sees straight down ({cameras})"
+
+
+def _cause(camera: PerceptionCamera, printed: str, checked: str, turned: bool) -> str:
+    """The likely cause of a contradiction. `turned`: as if the prints were turned by 180 degrees."""
+    if not turned or not is_apriltag(camera.settings.markers.dictionary or ""):
+        return f"check {checked}"
+    other = "apriltag" if printed == "opencv" else "opencv"
+    return (
+        "AprilRobotics' prints are turned by 180 degrees against OpenCV's: if these are "
+        f'{other}\'s, set markers.print = "{other}"; else check {checked}'
+    )
 
 
 def _continues(last: MarkerTarget, target: MarkerTarget) -> bool:

@@ -177,6 +177,22 @@ def test_heading_and_pad_offset_follow_the_print(tmp_path: Path, printed: str) -
 
 
 @pytest.mark.parametrize("printed", PRINTS)
+@pytest.mark.parametrize("setting", PRINTS)
+def test_markers_of_a_pad_that_disagree_name_the_print(printed: str, setting: str) -> None:
+    """A large marker 0.9 m to the small one's right, both printed the same way up."""
+    places: Places = {3: (0.0, 0.0, 0.0, 0.0, False), 4: (0.0, 0.9, 0.0, 0.0, False)}
+    settings = {"markers.print": setting, "markers.others": f"4:{SIZE_M}@3:0.9:0"}
+    pad = View(places, printed, settings, -90.0)
+    pad.frames(25)
+    if setting == printed:
+        assert pad.events == []
+    else:
+        assert len(pad.events) in (2, 3)
+        assert f'markers.print = "{printed}"' in pad.events[0][1]
+        assert "1.8 m" in pad.events[0][1]
+
+
+@pytest.mark.parametrize("printed", PRINTS)
 def test_boards_of_either_print_have_their_axes(tmp_path: Path, printed: str) -> None:
     file = tmp_path / "dock.toml"
     file.write_text(
