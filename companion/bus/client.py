@@ -15,7 +15,16 @@ from zenoh import ext
 
 from companion.bus.config import read_config_file
 from companion.bus.session import zenoh_config
-from companion.bus.topics import INPUT_TOPICS, ROOT, TOPICS, alive_key, command_key
+from companion.bus.topics import (
+    IMAGE,
+    INPUT_TOPICS,
+    LARGEST_JSON_BYTES,
+    ROOT,
+    TOPICS,
+    alive_key,
+    command_key,
+)
+from companion.peer_data import PeerDataError, check_size, parse_object
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0
@@ -224,6 +233,16 @@ def subscribe_kept(
         history=ext.HistoryConfig(detect_late_publishers=True),
         recovery=ext.RecoveryConfig(periodic_queries=None, heartbeat=True),
     )
+
+
+def image_of(sample: zenoh.Sample) -> tuple[bytes, dict[str, Any]]:
+    """Return a preview image, JPEG, and its attachment. Raises PeerDataError: too large, or not valid."""
+    check_size(len(sample.payload), IMAGE.largest_bytes)
+    attachment = sample.attachment
+    if attachment is None:
+        raise PeerDataError("an image without an attachment")
+    check_size(len(attachment), LARGEST_JSON_BYTES)
+    return sample.payload.to_bytes(), parse_object(attachment.to_bytes())
 
 
 def _text_of(sample: zenoh.Sample) -> str:

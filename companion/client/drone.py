@@ -22,6 +22,7 @@ from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBod
 from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.stream import Stream
+from companion.peer_data import PeerDataError, check_size, parse_object
 from companion.settings import ZenohSection
 
 # Longer than any command; a caller's `asyncio.timeout` ends it earlier.
@@ -99,8 +100,12 @@ class Steering:
         self._publisher.put(json.dumps(body))
 
     def _on_status(self, sample: zenoh.Sample) -> None:
+        try:
+            check_size(len(sample.payload), topics.STATUS.largest_bytes)
+            behaviour = str(parse_object(sample.payload.to_bytes())["pilot"]["behaviour"])
+        except (PeerDataError, KeyError, TypeError):
+            return  # another program's
         self._statuses += 1
-        behaviour: str = json.loads(sample.payload.to_string())["pilot"]["behaviour"]
         # The first one may have been made before the command began.
         own = self._statuses == 1 or behaviour.startswith(f"velocity of {self.source}")
         self._replaced_by = "" if own else behaviour
@@ -278,7 +283,7 @@ class Drone(Commands):
 
     def _stream(self, topic: topics.Topic, camera: str | None, size: int) -> Stream[Any]:
         key = topic.key(self.name, camera)
-        decode = bytes if topic is topics.IMAGE else json.loads
+        decode = bytes if topic is topics.IMAGE else parse_object
         return Stream(self._session, topic, key, decode, size=size, max_age_s=topic.max_age_s)
 
 

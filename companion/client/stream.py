@@ -15,6 +15,7 @@ import zenoh
 
 from companion.bus.client import subscribe_kept
 from companion.bus.topics import Topic
+from companion.peer_data import PeerDataError
 
 T = TypeVar("T")
 
@@ -22,7 +23,8 @@ T = TypeVar("T")
 class _Queue:
     """Bytes from zenoh's threads to the loop, with their time of arrival, seconds."""
 
-    def __init__(self, size: int) -> None:
+    def __init__(self, size: int, largest_bytes: int) -> None:
+        self._largest_bytes = largest_bytes
         self._items: deque[tuple[bytes, float]] = deque(maxlen=size)
         self._loop, self._lock = asyncio.get_running_loop(), threading.Lock()
         self._arrived, self._waking = asyncio.Event(), False
@@ -30,6 +32,10 @@ class _Queue:
 
     def put(self, sample: zenoh.Sample) -> None:
         """Add a message, from any thread. The loop is woken once, however many arrive meanwhile."""
+        if len(sample.payload) > self._largest_bytes:
+            with self._lock:
+                self.dropped += 1
+            return
         item = sample.payload.to_bytes(), time.monotonic()
         with self._lock:
             self.dropped += len(self._items) == self._items.maxlen
@@ -54,6 +60,7 @@ class Stream(AsyncIterator[T], Generic[T]):
     """The messages of one topic, the oldest first, until it is closed or deleted.
 
     Args:
+        decode: raises PeerDataError for a message that is dropped.
         size: messages that may wait; when one more arrives, the oldest is dropped.
         max_age_s: those that wait longer are dropped; None: any age.
 
@@ -74,7 +81,7 @@ class Stream(AsyncIterator[T], Generic[T]):
         if size < 1:
             raise ValueError(f"size must be at least 1, got {size}")
         self._decode, self._max_age_s = decode, max_age_s
-        self._queue, self._too_old = _Queue(size), 0
+        self._queue, self._unused = _Queue(size, topic.largest_bytes), 0
         self._arrived_s = -math.inf
         # The callback refers to the queue alone, so that a stream that nobody reads any more is deleted.
         put = self._queue.put
@@ -89,8 +96,9 @@ class Stream(AsyncIterator[T], Generic[T]):
         while True:
             data, self._arrived_s = await self._queue.get()
             if self._max_age_s is None or self.age_s <= self._max_age_s:
-                return self._decode(data)
-            self._too_old += 1
+                with suppress(PeerDataError):
+                    return self._decode(data)
+            self._unused += 1
 
     @property
     def age_s(self) -> float:
@@ -99,7 +107,7 @@ class Stream(AsyncIterator[T], Generic[T]):
 
     @property
     def dropped(self) -> int:
-        return self._queue.dropped + self._too_old
+        return self._queue.dropped + self._unused
 
     def close(self) -> None:
         """End the subscription, as deleting the stream does."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import math
 import threading
 import time
 from collections import deque
@@ -20,13 +19,22 @@ from typing import Any
 
 import zenoh
 
-from companion.bus.client import subscribe_kept
-from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
+from companion.bus.client import image_of, subscribe_kept
+from companion.bus.topics import (
+    DETECTIONS,
+    EVENTS,
+    IMAGE,
+    LARGEST_JSON_BYTES,
+    ROOT,
+    SETPOINT,
+    STATUS,
+    VEHICLE,
+)
 from companion.dashboard.merge import Sighting
+from companion.peer_data import PeerDataError, check_size, parse_object
 
 logger = logging.getLogger(__name__)
 
-LARGEST_JSON_BYTES, LARGEST_IMAGE_BYTES = 1 << 18, 1 << 23
 MAX_RATE_HZ = 15.0
 """Of images; those in between are dropped."""
 MAX_CAMERAS, MAX_BOXES = 16, 200
@@ -258,16 +266,16 @@ class Bridge:
         now_s = time.monotonic()
         # A camera's interval varies by some milliseconds.
         too_soon = now_s < camera.due_s - 0.2 / MAX_RATE_HZ
-        if too_soon or len(sample.payload) > LARGEST_IMAGE_BYTES:
+        if too_soon:
             return
         try:
-            attachment = json.loads(sample.attachment.to_string()) if sample.attachment else {}
+            data, attachment = image_of(sample)
             about = {key: attachment.get(key) for key in ("sequence", "captured_ns", "annotated")}
             about |= _boxes(list(camera.frames), int(attachment["sequence"]))
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             logger.debug("an image without usable attachment", exc_info=True)
             return
-        camera.image = CameraImage(sample.payload.to_bytes(), about)
+        camera.image = CameraImage(data, about)
         camera.due_s = max(camera.due_s + 1 / MAX_RATE_HZ, now_s)
         loop = self._link.loop
         if loop is not None and not loop.is_closed():
@@ -325,23 +333,12 @@ def _is_plausible(one: Sighting) -> bool:
 
 
 def _json(sample: zenoh.Sample) -> dict[str, Any] | None:
-    """Return a message's object; None if it is none, too large, or not strict JSON."""
-    if len(sample.payload) > LARGEST_JSON_BYTES:
-        return None
-
-    def refuse(constant: str) -> None:
-        raise ValueError(constant)  # NaN and Infinity, which browsers do not read
-
-    def finite(number: str) -> float:
-        if not math.isfinite(value := float(number)):
-            raise ValueError(number)  # 1e999
-        return value
-
+    """Return a message's object; None if it is none, too large, or not strict JSON, which browsers need."""
     try:
-        value = json.loads(sample.payload.to_bytes(), parse_constant=refuse, parse_float=finite)
-    except (ValueError, RecursionError):
+        check_size(len(sample.payload), LARGEST_JSON_BYTES)
+        return parse_object(sample.payload.to_bytes())
+    except PeerDataError:
         return None
-    return value if isinstance(value, dict) else None
 
 
 def undeclare(subscribers: list[Any]) -> None:

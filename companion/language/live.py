@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import time
 from collections import deque
@@ -17,6 +16,7 @@ import zenoh
 from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody
 from companion.bus.bodies.service import EventBody, StatusBody, StatusCameraBody
+from companion.bus.client import image_of
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
 from companion.language.control import CommandEvents, Control
@@ -24,6 +24,7 @@ from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import Endpoint
 from companion.language.scene import Scene, SceneObject
 from companion.language.tools import class_names_of
+from companion.peer_data import PeerDataError
 
 T = TypeVar("T")
 
@@ -196,10 +197,10 @@ class LiveVehicle:
         loop = asyncio.get_running_loop()
 
         def receive(sample: zenoh.Sample) -> None:
-            if sample.attachment is not None:
-                number = json.loads(sample.attachment.to_string())["sequence"]
-                with suppress(RuntimeError):  # the loop is closed
-                    loop.call_soon_threadsafe(jpegs.__setitem__, number, sample.payload.to_bytes())
+            # Another program's message has no such number; the loop may be closed.
+            with suppress(PeerDataError, KeyError, RuntimeError):
+                jpeg, about = image_of(sample)
+                loop.call_soon_threadsafe(jpegs.__setitem__, about["sequence"], jpeg)
 
         key = topics.IMAGE.key(self._drone.name, self._camera)
         return self._drone.session.declare_subscriber(key, receive)

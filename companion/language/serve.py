@@ -63,11 +63,11 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
 
     async def answer(query: zenoh.Query) -> None:
         nonlocal lines, running
-        payload = b"" if query.payload is None else query.payload.to_bytes()
-        if len(payload) > MAX_SENTENCE_BYTES:
-            await reply(query, f"the sentence has {len(payload)} bytes, at most {MAX_SENTENCE_BYTES}", "")
+        sentence = query.payload
+        if sentence is not None and len(sentence) > MAX_SENTENCE_BYTES:
+            await reply(query, f"the sentence has {len(sentence)} bytes, at most {MAX_SENTENCE_BYTES}", "")
             return
-        text = payload.decode(errors="replace")
+        text = (b"" if sentence is None else sentence.to_bytes()).decode(errors="replace")
         if is_stop(text):
             if running is not None:
                 running.cancel()  # first: it sends nothing after the stop

@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import zenoh
 
 from companion import connect
 from companion.bus import topics
@@ -246,7 +247,7 @@ class ScriptedSession:
 
     def receive(self, number: int) -> None:
         data = json.dumps({"number": number}).encode()
-        self.put(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: data)))
+        self.put(SimpleNamespace(payload=zenoh.ZBytes(data)))
 
 
 @pytest.mark.parametrize(("waited_s", "first"), [(0.4, 1), (0.6, 2)])
@@ -370,3 +371,17 @@ async def test_service_that_ends_fails_a_waiting_command() -> None:
         await there.bus.close()
         with pytest.raises((NoAnswerError, CommandFailedError)):
             await asyncio.wait_for(task, 20.0)
+
+
+@pytest.mark.realtime
+async def test_bad_messages_of_others_are_dropped_and_counted() -> None:
+    async with connected() as (there, drone):
+        stream = drone.vehicle(size=10)
+        await watched(there, topics.VEHICLE)
+        huge = b" " * (topics.VEHICLE.largest_bytes + 1)
+        for data in (b"", b"[]", b"\xff", b'{"a": NaN}', b"[" * 10_000, huge):
+            there.bus.publish(topics.VEHICLE, data)
+        there.bus.publish(topics.VEHICLE, {"altitude_m": 5.0})
+        async with asyncio.timeout(20.0):
+            assert await anext(stream) == {"altitude_m": 5.0}
+        await until(lambda: stream.dropped == 6)
