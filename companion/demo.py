@@ -20,6 +20,7 @@ from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import DETECTIONS
 from companion.dashboard.process import dashboard_process
 from companion.service import Event, Service
+from companion.service.ending import EndedError, until_ended
 from companion.sim_session import (
     FIND,
     MISSION,
@@ -84,7 +85,12 @@ def run_demo(output: Path, *, seed: int, limit_s: float, say: Say, vehicle_url: 
     truth_path = output / "truth.jsonl"
     truth_path.unlink(missing_ok=True)
     started = time.monotonic()
-    flight = asyncio.run(_fly(output, truth_path, vehicle_url, seed=seed, limit_s=limit_s, say=say))
+    try:
+        flight = asyncio.run(
+            until_ended(_fly(output, truth_path, vehicle_url, seed=seed, limit_s=limit_s, say=say))
+        )
+    except EndedError as error:
+        raise SimSessionError(f"the demonstration was {error}") from None
     final_range_m = _range_at(truth_path, flight.reached_ns, seed) if flight.reached_ns else None
     reached = final_range_m is not None and abs(final_range_m - STOP_DISTANCE_M) <= RANGE_TOLERANCE_M
     landed = flight.ended and _landed(truth_path, flight.on_ground)

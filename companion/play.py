@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import signal
 import socket
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
@@ -16,6 +15,7 @@ from companion.guidance import grammar
 from companion.language.process import AskProcess
 from companion.operator.console import run_console, terminal_is_free
 from companion.service import Event, Service
+from companion.service.ending import on_ending
 from companion.settings import Settings
 from companion.settings.perception import NO_SOURCE
 from companion.sim_session import (
@@ -75,7 +75,7 @@ class SimulationLostError(SimSessionError):
 
 
 def play(settings: Settings, options: PlayOptions, say: Say) -> None:
-    """Start everything, print example commands, and take commands until SIGINT, SIGTERM or `quit`.
+    """Start everything, print example commands, and take commands until a signal or `quit` ends it.
 
     Raises:
         SimSessionError: it cannot start, for example for an unknown scene.
@@ -110,15 +110,14 @@ def _check_zenoh_ports(settings: Settings) -> None:
 
 async def _play(settings: Settings, options: PlayOptions, scene: Scene, say: Say) -> None:
     stop = asyncio.Event()
-    loop = asyncio.get_running_loop()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop.set)
+    watch = on_ending(stop.set)
     starting = asyncio.create_task(_until_stopped(settings, options, scene, say, stop))
     stopping = asyncio.create_task(stop.wait())
     try:
         await asyncio.wait({starting, stopping}, return_when=asyncio.FIRST_COMPLETED)
     finally:
         stopping.cancel()
+        watch.cancel()
         if not starting.done():
             starting.cancel()
         ended = (await asyncio.gather(starting, return_exceptions=True))[0]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
-import signal
 import sys
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def run(settings: Settings) -> None:
-    """Run the service. Ends on Ctrl-C or SIGTERM."""
+    """Run the service. Ends as `companion.service.ending` says."""
     with gc_paused():
         from companion.bus.session import BusError
         from companion.language.process import AskProcess
@@ -57,7 +56,8 @@ def _freeze_loaded_objects() -> None:
 
 
 async def _run_until_signal(settings: Settings, service: Service) -> None:
-    loop = asyncio.get_running_loop()
+    from companion.service.ending import on_ending
+
     ready = asyncio.Event()
 
     def on_ready() -> None:
@@ -73,17 +73,17 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
         )
 
     running = asyncio.ensure_future(service.run(on_ready))
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # Before the service is ready there is nothing to shut down.
-        loop.add_signal_handler(number, lambda: service.stop() if service.ready else running.cancel())
+    # Before the service is ready there is nothing to shut down.
+    watch = on_ending(lambda: service.stop() if service.ready else running.cancel())
     page = spawn(_run_dashboard(settings, ready), "dashboard")
     try:
         await running
     except asyncio.CancelledError:
         raise typer.Exit(EXIT_FAILED) from None
     finally:
+        watch.cancel()
         page.cancel()
-        await asyncio.gather(page, return_exceptions=True)
+        await asyncio.gather(watch, page, return_exceptions=True)
 
 
 async def _run_dashboard(settings: Settings, ready: asyncio.Event) -> None:

@@ -47,7 +47,9 @@ async def run_console(
     on_event: Callable[[str, str], None],
     ask: Ask | None = None,
 ) -> None:
-    """Read commands until end of file or `quit`. A command runs while the next is typed.
+    """Read commands until `quit` or the end of file, which end the service: a closed terminal, Ctrl-D.
+
+    A command runs while the next is typed.
 
     Answers go to standard error, which must not wait for its reader (`line_output.py`).
     Never raises: an error of the console must not affect the flight.
@@ -110,6 +112,7 @@ async def _read_commands(
                 task = spawn(answer(text), "answer on the console")
                 running.add(task)
                 task.add_done_callback(running.discard)
+        quit_service()
     finally:
         transport.close()
         if ask is not None:

@@ -216,8 +216,9 @@ def main(arguments: list[str]) -> int:
 
 
 def _end_with(service_pid: int) -> None:
-    """Let the kernel send SIGTERM when the service dies; ignore Ctrl-C, which is for the service."""
+    """Let the kernel send SIGTERM when the service dies; what a terminal sends to all is for the service."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != service_pid:  # it died before prctl

@@ -21,7 +21,8 @@ _RETRY_S = 2.0
 
 def main(argument: str) -> int:
     """Work until the parent ends; returns the exit code."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, as a closed terminal is
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     ending = Event()
     on_parent_end(ending.set)
     values = json.loads(argument)

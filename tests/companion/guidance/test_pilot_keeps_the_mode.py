@@ -13,17 +13,19 @@ from functools import cache
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.bench.simulated_driver import RATES_HZ
+from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.guidance.interface import Request, SetMode
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
 from companion.service.guidance_loop import mode_at_shutdown
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.px4.modes import Mode
 
 EVERY_S = 0.05
+# A change of the mode is not reported sooner after another one. What ours overrides meanwhile, nobody knows.
+REPORT_PERIOD_S = {"1.14": 1.0, "1.15": 0.1, "1.17": 0.1}  # 1.14: by HEARTBEAT only
 PILOTS = Mode.POSCTL
 SHUTDOWN = 99  # identifier of its request
 FENCE = {"GF_ACTION": 2.0, "GF_MAX_HOR_DIST": 14.0}
@@ -138,7 +140,11 @@ def airborne(px4: str) -> LockstepVehicle:
 
 
 class PilotedFlight:
-    """One flight with one change of the pilot. `seen`: modes as reported, in order."""
+    """One flight with one change of the pilot.
+
+    Attributes:
+        reported: modes as they were reported, in order. overridden_s: how long the pilot's lasted.
+    """
 
     def __init__(self, sender: str, fault: str, px4: str) -> None:
         self.sender, (commands, self.delay_s) = SENDERS[sender], FAULTS[fault]
@@ -152,7 +158,19 @@ class PilotedFlight:
         self.sender.ready(self.flight)
         # A lost acknowledgement cannot tell that ours has arrived after a change that was not read yet.
         self.read_at_once = "lost_ack" in commands
-        self.seen: list[FlightMode] = []
+        self.reported: list[FlightMode] = []
+        self.overridden_s: float | None = None
+        self._changed_s: float | None = None
+        driver = self.flight.driver
+        assert isinstance(driver, SimulatedDriver)
+        on_report = driver._changes.on_report
+
+        def note(state: VehicleState, now_ns: int, answered_ns: int) -> None:
+            if self.reported[-1:] != [state.mode]:
+                self.reported.append(state.mode)
+            on_report(state, now_ns, answered_ns)
+
+        driver._changes.on_report = note  # type: ignore[method-assign]
 
     def fly(self, pilot_s: float) -> Mode:
         """The pilot changes the mode so long after the request; 0: just before it. Returns the last mode."""
@@ -165,7 +183,13 @@ class PilotedFlight:
         self._run(3.0 + 4 * self.delay_s)
         return self.flight.vehicle.vehicle.autopilot.mode
 
+    def unreported(self, period_s: float) -> bool:
+        """Whether ours overrode the pilot's mode before it was reported."""
+        unseen = FlightMode.POSITION not in self.reported
+        return unseen and self.overridden_s is not None and self.overridden_s <= period_s
+
     def _pilot(self) -> None:
+        self._changed_s = self.flight.vehicle.now_s
         self.flight.vehicle.vehicle.autopilot.pilot_takes_over(PILOTS)
         # Until it is reported. A change that ours overrides within these 4 ms is known to nobody.
         step = self.flight.driver.step if self.read_at_once else self.flight.vehicle.step
@@ -174,8 +198,10 @@ class PilotedFlight:
     def _run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.01)):
             self.flight.tick()
-            if self.seen[-1:] != [self.flight.state.mode]:
-                self.seen.append(self.flight.state.mode)
+            vehicle = self.flight.vehicle
+            changed = self._changed_s is not None and vehicle.vehicle.autopilot.mode is not PILOTS
+            if changed and self.overridden_s is None:
+                self.overridden_s = vehicle.now_s - (self._changed_s or 0.0)
 
 
 def moments(sender: str, fault: str, every_s: float) -> list[float]:
@@ -184,26 +210,18 @@ def moments(sender: str, fault: str, every_s: float) -> list[float]:
     return [number * every_s for number in range(round(course_s / every_s) + 1)]
 
 
-def unknowable(sender: str, fault: str, pilot_s: float) -> bool:
-    """Whether nothing tells a change of that moment, just before the request, from one after it.
-
-    PX4 reports no second change within 0.1 s, here that of the pilot after that of the failsafe; and without
-    acknowledgements the report of our mode may as well be of the pilot's own choice.
-    """
-    return not pilot_s and (sender == "yield" or fault == "acknowledgements lost")
-
-
 def overridden(
     sender: str, fault: str, moments_s: list[float], px4: str = "1.17"
 ) -> list[tuple[float, Mode, list[str]]]:
     """The moments of a pilot's change after which the mode is another one, with the reported modes."""
     found = []
     for pilot_s in moments_s:
-        if unknowable(sender, fault, pilot_s):
-            continue
+        if not pilot_s and fault == "acknowledgements lost":
+            continue  # without them, our mode may as well be the pilot's own choice
         flight = PilotedFlight(sender, fault, px4)
-        if (mode := flight.fly(pilot_s)) is not PILOTS:
-            found.append((pilot_s, mode, [str(mode) for mode in flight.seen]))
+        mode = flight.fly(pilot_s)
+        if mode is not PILOTS and not flight.unreported(REPORT_PERIOD_S[px4]):
+            found.append((pilot_s, mode, [str(mode) for mode in flight.reported]))
     return found
 
 
@@ -215,17 +233,8 @@ def test_last_mode_is_the_pilots(sender: str, fault: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("px4", ["1.15", "1.17"])
+@pytest.mark.parametrize("px4", REPORT_PERIOD_S)
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("sender", SENDERS)
 def test_last_mode_is_the_pilots_at_each_moment(sender: str, fault: str, px4: str) -> None:
     assert overridden(sender, fault, moments(sender, fault, EVERY_S), px4) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("fault", FAULTS)
-@pytest.mark.parametrize("sender", SENDERS)
-def test_change_that_px4_1_14_reports_is_the_last(sender: str, fault: str) -> None:
-    """It reports the mode once a second: a change that ours overrides before that is known to nobody."""
-    found = overridden(sender, fault, moments(sender, fault, EVERY_S), "1.14")
-    assert [one for one in found if str(FlightMode.POSITION) in one[2]] == []

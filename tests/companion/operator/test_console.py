@@ -88,7 +88,7 @@ async def test_commands_are_answered_until_quit(terminal: int, capsys: pytest.Ca
     assert service.events == []
 
 
-async def test_closed_terminal_ends_only_the_console(terminal: int) -> None:
+async def test_closed_terminal_ends_the_service(terminal: int) -> None:
     service = Service()
     running = asyncio.create_task(service.run())
     os.write(terminal, b"hold\n")
@@ -96,7 +96,7 @@ async def test_closed_terminal_ends_only_the_console(terminal: int) -> None:
         await asyncio.sleep(0.001)
     os.close(terminal)
     await running
-    assert not service.stopped
+    assert service.stopped
     assert service.events == []
 
 

@@ -1,0 +1,84 @@
+"""Everything that ends the service ends it alike: HOLD, the pending command answered, exit code 0."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mavlink_sim.testing import running_simulator
+from tests.companion.service_process import TWICE, ServiceProcess, running_service
+
+pytestmark = pytest.mark.realtime
+
+NO_CAMERA = ("--source", "none")
+# Ends as a program that flies, when its reader or a signal says so; 7: it was ended in order.
+PROGRAM = """
+import asyncio, sys
+from companion.service.ending import EndedError, until_ended
+async def work():
+    print("working", flush=True)
+    try:
+        await asyncio.Event().wait()
+    finally:
+        await asyncio.sleep(1.0)  # a hold, say: a second signal does not skip it
+        open(sys.argv[1], "w").close()
+try:
+    asyncio.run(until_ended(work()))
+except EndedError:
+    sys.exit(7)
+"""
+
+
+def end(service: ServiceProcess, way: str, terminal: int) -> None:
+    if way == "terminal":
+        os.close(terminal)
+        return
+    for name in way.split():
+        service.signal(signal.Signals[name])
+
+
+@pytest.mark.parametrize("way", ["SIGINT", "SIGTERM", "SIGHUP", "SIGTERM SIGINT SIGHUP", "terminal"])
+def test_ending_in_flight_requests_hold(way: str, tmp_path: Path) -> None:
+    terminal, console = pty.openpty()
+    replies: list[dict[str, Any]] = []
+    with (
+        running_simulator(**TWICE) as simulator,
+        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path, stdin=console) as service,
+    ):
+        os.close(console)
+        service.take_off(2.0)
+        asking = threading.Thread(target=lambda: replies.append(service.command("goto 60 0")))
+        asking.start()
+        simulator.wait_for_event("mode OFFBOARD")
+        offboard = simulator.events.index("mode OFFBOARD")
+        end(service, way, terminal)
+        assert service.process.wait(20) == 0
+        simulator.wait_for_event("mode HOLD", since=offboard)
+        asking.join(20)
+    assert [reply["success"] for reply in replies] == [False]
+    if way != "terminal":
+        os.close(terminal)
+
+
+@pytest.mark.parametrize("way", ["SIGINT", "SIGTERM", "SIGHUP", "reader"])
+def test_work_ends_in_order_by_each_way(way: str, tmp_path: Path) -> None:
+    ended = tmp_path / "ended"
+    program = [sys.executable, "-c", PROGRAM, str(ended)]
+    with subprocess.Popen(program, stdout=subprocess.PIPE) as running:
+        assert running.stdout is not None
+        assert running.stdout.readline() == b"working\n"
+        if way == "reader":
+            running.stdout.close()
+        else:
+            for _ in range(2):
+                running.send_signal(signal.Signals[way])
+        assert running.wait(20) == 7
+    assert ended.exists()
