@@ -26,11 +26,10 @@ from companion.perception.freeze_reports import FreezeReports
 from companion.perception.marker_tracker import MarkerTracker
 from companion.plugins import load_plugins
 from companion.recording.guidance_record import StepContext
+from companion.service.autopilot_reports import AutopilotReports
 from companion.service.velocity_senders import VelocitySenders
 from companion.settings import CameraSection, Settings
 from companion.vehicle.autopilot_parameters import NOTHING_READ
-from companion.vehicle.px4_modes import among_modes
-from companion.vehicle.report import Report
 from companion.vehicle.state import FlightMode, VehicleState
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected
@@ -39,8 +38,6 @@ logger = logging.getLogger(__name__)
 
 # Maximum length of a command line; a path of hundreds of points fits.
 LONGEST_LINE = 8000
-# Minimum interval of a repeated autopilot text, and the number of texts remembered for that.
-REPEAT_INTERVAL_S, MAX_REMEMBERED = 10.0, 100
 
 
 class InputAssembler:
@@ -76,20 +73,14 @@ class InputAssembler:
         self._shown: tuple[FlightMode, bool] | None = None
         self._mode_changes = 0
         self._on_event = on_event
-        self._reported: tuple[Report, ...] = ()
-        self._logged_ns: dict[str, int] = {}
+        self._reports = AutopilotReports(on_event)
         self._recorded_section: CameraSection | None = None
         self._section_json = ""
         self._freezes = FreezeReports(on_event)
 
     def on_state(self, state: VehicleState) -> None:
         """Process a new snapshot of the vehicle."""
-        if state.reports is not self._reported:
-            self._log_reports(state)
-        if state.mode_restored and (
-            self._state is None or state.mode_restored is not self._state.mode_restored
-        ):
-            self._on_event("warning", state.mode_restored)
+        self._reports.update(state)
         if (state.mode, state.armed) != self._shown:
             self._shown = (state.mode, state.armed)
             self._mode_changes += 1
@@ -97,19 +88,6 @@ class InputAssembler:
         for camera in self._cameras.values():
             camera.in_flight = state.in_flight
         self.history.add(state)
-
-    def _log_reports(self, state: VehicleState) -> None:
-        """Pass on the autopilot's warnings about its current mode."""
-        last_ns = self._reported[-1].stamp_ns if self._reported else 0
-        self._reported = state.reports
-        for report in state.warnings_since(last_ns + 1):
-            logged_ns = self._logged_ns.get(report.text)
-            due = logged_ns is None or report.stamp_ns - logged_ns >= REPEAT_INTERVAL_S * 1e9
-            if due and among_modes(state.mode, report.modes):
-                self._logged_ns[report.text] = report.stamp_ns
-                self._on_event("warning", f"autopilot: {report.text}")
-        if len(self._logged_ns) > MAX_REMEMBERED:
-            self._logged_ns.clear()
 
     def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
         """Process a camera's result, unless it repeats one; returns its markers if marker detection is on."""

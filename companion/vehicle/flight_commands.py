@@ -9,6 +9,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 
+from companion.tasks import spawn
 from companion.vehicle.autopilot_profile import HOME_POSITION_ID
 from companion.vehicle.driver import CommandRefusedError, TakenOverError
 from companion.vehicle.mav_result import result_name
@@ -108,7 +109,7 @@ class FlightCommands:
         """Our message has overridden a pilot's change, which is requested again."""
         logger.warning("%s: %s", self._url, text)
         self._telemetry.on_mode_restored(text)
-        task = asyncio.create_task(self._follow(change), name=f"mode of {self._url}")
+        task = spawn(self._follow(change), f"mode of {self._url}")
         self._restoring.add(task)
         task.add_done_callback(self._restoring.discard)
 

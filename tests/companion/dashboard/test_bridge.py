@@ -14,8 +14,16 @@ import pytest
 import zenoh
 
 from companion.bus.session import Bus, zenoh_config
-from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, STATUS, VEHICLE, alive_key, command_key
-from companion.dashboard.bridge import LARGEST_JSON_BYTES
+from companion.bus.topics import (
+    DETECTIONS,
+    EVENTS,
+    IMAGE,
+    LARGEST_JSON_BYTES,
+    STATUS,
+    VEHICLE,
+    alive_key,
+    command_key,
+)
 from companion.dashboard.fleet import MAX_COMMANDS, Fleet
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
