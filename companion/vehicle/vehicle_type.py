@@ -10,8 +10,9 @@ in Copter and QSTABILIZE, without throttle, in Plane. So a vehicle that is not l
     every other type                         not flown                         not flown
 
 ArduPilot's quadplanes are vehicles of Plane, whose modes have other numbers, in hover too. They report the
-type that the parameter Q_MAV_TYPE says, by default a fixed wing, but also a quadrotor. Only a quadplane has a
-vtol_state, so with ArduPilot no type is known before EXTENDED_SYS_STATE has been received.
+type that the parameter Q_MAV_TYPE says, by default a fixed wing, but also a quadrotor. Copter's vtol_state is
+always MC (4.7, measured), a quadplane's only in hover: one that claims to be a quadrotor is recognised in
+transition and in forward flight, but not in hover. With ArduPilot no type is known before EXTENDED_SYS_STATE.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ AUTOPILOT_NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}
 
 
 class VtolState(IntEnum):
-    """MAV_VTOL_STATE. Of a vehicle that is no VTOL it is UNDEFINED."""
+    """MAV_VTOL_STATE. Of a vehicle that is no VTOL it is UNDEFINED, of ArduPilot's Copter MC."""
 
     UNDEFINED = 0
     TRANSITION_TO_FW = 1
@@ -109,8 +110,8 @@ def why_not_flown(mav_type: int, autopilot: int, vtol_state: VtolState | None) -
             return f"{what}: {_FLOWN}"
         if vtol_state is None:
             return VTOL_STATE_MISSING
-        if vtol_state is not VtolState.UNDEFINED:
-            return f"{what} and reports a vtol_state, so it is a quadplane: {_FLOWN}"
+        if vtol_state not in (VtolState.UNDEFINED, VtolState.MC):
+            return f"{what} {_VTOL_WORDS[vtol_state]}, so it is a quadplane: {_FLOWN}"
         return None
     if vtol_state is VtolState.MC or (mav_type in MULTICOPTERS and not vtol_state):
         return None

@@ -68,6 +68,7 @@ IDLE_THRUST_MPS2 = 0.6
 class Autopilot:
     """The decisions of one vehicle. `now_s` is the time since boot, advanced by `update`."""
 
+    vtol_state = 0  # MAV_VTOL_STATE_UNDEFINED
     # time of ground contact until it is landed
     _land_detection_s = LAND_DETECTION_S
 

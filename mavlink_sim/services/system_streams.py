@@ -33,7 +33,8 @@ def timesync(vehicle: ServiceContext) -> Any:
 
 
 def extended_sys_state(vehicle: ServiceContext) -> Any:
-    return dialect.MAVLink_extended_sys_state_message(0, int(vehicle.autopilot.landed_state))
+    autopilot = vehicle.autopilot
+    return dialect.MAVLink_extended_sys_state_message(autopilot.vtol_state, int(autopilot.landed_state))
 
 
 def sys_status(vehicle: ServiceContext) -> Any:

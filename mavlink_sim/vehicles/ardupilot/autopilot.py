@@ -108,6 +108,7 @@ class CopterAutopilot(Autopilot):
 
     mode: Any
     intended_mode: Any
+    vtol_state = 3  # MAV_VTOL_STATE_MC, as Copter's always is
     _land_detection_s = LAND_DETECTION_S
 
     def __init__(

@@ -87,6 +87,7 @@ async def test_denied_arming_of_copter_has_its_reason() -> None:
         driver = open_driver("pymavlink", f"udpin://127.0.0.1:{simulator.onboard_port}")
         await driver.connect(20.0)
         try:
+            await wait_for_state(driver, lambda state: state.vtol_state is not None)
             with pytest.raises(CommandRefusedError, match=r"\(.*\): (Pre)?Arm: "):
                 await driver.arm()
         finally:
