@@ -384,7 +384,7 @@ def test_every_part_is_in_the_document(package: str) -> None:
     assert not sorted(name for name in names if name not in document)
 
 
-def test_an_assert_only_tells_the_type_checker() -> None:
+def test_an_assert_only_narrows_a_type() -> None:
     """`python -O` removes it, so it must not check what may come: only what the code itself has made sure."""
     for package in ("companion", "vision", "mavlink_sim"):
         for path in (ROOT / package).rglob("*.py"):

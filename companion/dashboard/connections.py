@@ -1,6 +1,6 @@
-"""The connections of an HTTP server: what strangers hold open takes nothing from those who may command.
+"""The connections of an HTTP server: what unknown clients hold open takes nothing from those who may command.
 
-A connection is a stranger's until a request of it has passed the access rules. Strangers, bodies that have
+A connection is unknown until a request of it has passed the access rules. Unknown ones, bodies that have
 not arrived, and connections that wait for their next request each have a limit of their own. There the oldest
 is closed, so that a new one always has its turn. Requests that are being answered have a limit too, but not
 those by POST: `stop` is one of them, and they are short.
@@ -20,7 +20,7 @@ from uvicorn.server import ServerState
 
 REQUEST_S = 5.0
 """A request whose head and body have not arrived after this is closed."""
-MAX_STRANGERS = MAX_IDLE = MAX_UNREAD = 64
+MAX_UNKNOWN = MAX_IDLE = MAX_UNREAD = 64
 MAX_ANSWERED = 100
 """Requests that are being answered, most of them streams."""
 _KEY = "connection"
@@ -30,14 +30,14 @@ class ConnectionTable:
     """The connections of one server by their state. The first of each is the oldest."""
 
     def __init__(self) -> None:
-        self._strangers: dict[Connection, None] = {}
+        self._unknown: dict[Connection, None] = {}
         self._idle: dict[Connection, None] = {}
         self._unread: dict[Connection, None] = {}
         self._answered: set[Connection] = set()
 
     def open(self, connection: Connection) -> None:
-        """Add a new connection, of a stranger."""
-        _add(self._strangers, connection, MAX_STRANGERS)
+        """Add a new connection, an unknown one."""
+        _add(self._unknown, connection, MAX_UNKNOWN)
 
     def admit(self, connection: Connection, *, short: bool) -> bool:
         """Begin a request that passed the access rules; False: too many are being answered.
@@ -68,7 +68,7 @@ class ConnectionTable:
         self._forget(connection)
 
     def _forget(self, connection: Connection) -> None:
-        for part in (self._strangers, self._idle, self._unread):
+        for part in (self._unknown, self._idle, self._unread):
             part.pop(connection, None)
         self._answered.discard(connection)
 

@@ -339,7 +339,7 @@ async def test_request_that_does_not_end_is_closed(monkeypatch: pytest.MonkeyPat
             writer.close()
 
 
-async def test_strangers_leave_the_streams_of_others_alone(tmp_path: Path) -> None:
+async def test_connections_without_token_end_no_stream_of_others(tmp_path: Path) -> None:
     path = tmp_path / "token"
     path.write_text(TOKEN)
     path.chmod(0o600)
