@@ -128,6 +128,7 @@ AWAITED_TASKS = {
     "companion/language/serve.py",
     "companion/perception/supervisor.py",
     "companion/play.py",
+    "companion/service/ending.py",
     "companion/service/service.py",
     "companion/service/tasks.py",
     "companion/sim_session.py",

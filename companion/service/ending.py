@@ -13,6 +13,8 @@ import signal
 from collections.abc import Callable, Coroutine
 from typing import TypeVar
 
+from companion.tasks import spawn
+
 _T = TypeVar("_T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _OUTPUTS = (1, 2)  # descriptors of standard output and error
@@ -36,7 +38,7 @@ def on_ending(end: Callable[[], object]) -> asyncio.Task[None]:
     for number in SIGNALS:
         if signal.getsignal(number) is not signal.SIG_IGN:  # `nohup` ignores SIGHUP
             loop.add_signal_handler(number, end)
-    return asyncio.create_task(_watch_readers(end), name="readers of the output")
+    return spawn(_watch_readers(end), "readers of the output")
 
 
 async def until_ended(work: Coroutine[object, object, _T]) -> _T:
