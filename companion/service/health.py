@@ -119,15 +119,15 @@ class Health:
         self._report_not_flown(self._driver.state)
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + round(HEARTBEAT_PERIOD_S * 1e9)
+            shared = self._others.shares_address(self._driver.state, now_ns)
+            if shared and not guidance.in_command:
+                self._driver.change_address()
             healthy = self.healthy(now_ns)
             self._driver.send_heartbeat(
                 SystemStatus.ACTIVE if healthy else SystemStatus.CRITICAL,
                 uptime_s=self._others.uptime_s(now_ns),
                 in_command=guidance.in_command,
             )
-            shared = self._others.shares_address(self._driver.state, now_ns)
-            if shared and not guidance.in_command:
-                self._driver.change_address()
             self._others.watch(self._driver.state, now_ns, in_command=guidance.in_command)
             self._notifier.alive()
         if now_ns >= self._hud_due_ns:

@@ -46,6 +46,7 @@ class OwnAddress:
         self.address: Address = (system_id, component_id)
         self.others = tuple(others)
         self._all = (component_id, *self.others)
+        self._left: set[int] = set()
         self.forget()
 
     def forget(self) -> None:
@@ -115,13 +116,16 @@ class OwnAddress:
     def change(self, now_ns: int, *, at_random: bool = False) -> bool:
         """Take a free component id, the next one or any; False: there is none.
 
-        At random where the other program may be a service that changes its own at the same time.
+        At random where the other program may be a service that changes its own at the same time. An id that
+        was shared is not used again: a router delivers nothing with it to whoever has sent with it.
         """
         own = self._all.index(self.address[1])
         in_turn = (*self._all[own + 1 :], *self._all[:own])
-        free = [number for number in in_turn if number not in self._taken(now_ns)]
+        free = [number for number in in_turn if number not in self._taken(now_ns) | self._left]
         if not free:
             return False
+        if at_random:
+            self._left.add(self.address[1])
         self.address = (self.address[0], random.choice(free) if at_random else free[0])
         self._foreign_ns.clear()
         return True

@@ -12,7 +12,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode
 from mavlink_sim.testing import free_port
 from tests.companion.live_flight import LiveFlight
-from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot
+from tests.companion.vehicle.fake_autopilot import OFFBOARD, SETPOINT, FakeAutopilot
 from tests.companion.vehicle.test_vehicle_type import ALLOWED_COMMANDS
 
 pytestmark = pytest.mark.realtime
@@ -62,7 +62,7 @@ async def test_shutdown_after_a_change_of_type_sends_no_mode() -> None:
     flight = LiveFlight("pymavlink", port)
     try:
         async with flight.running():
-            vehicle.mav_type = FIXED_WING
+            vehicle.mav_type, vehicle.custom_mode = FIXED_WING, OFFBOARD
             await flight.until(lambda: flight.driver.state.not_flown)
             vehicle.drain()
             before = len(vehicle.received_named("COMMAND_LONG"))

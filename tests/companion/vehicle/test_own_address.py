@@ -180,6 +180,14 @@ def test_changed_address_is_that_of_every_message() -> None:
 COMMAND_FIELDS = mavlink.MAVLink_command_long_message.fieldnames
 
 
+def test_shared_ids_are_not_used_again() -> None:
+    one = scripted()
+    used = [one.driver.own_address[1]]
+    while one.driver.change_address():
+        used.append(one.driver.own_address[1])
+    assert sorted(used) == [191, *OTHERS]
+
+
 def test_no_change_without_a_free_id() -> None:
     one = scripted()
     for number in OTHERS:

@@ -324,7 +324,7 @@ async def test_repeated_command_ends_with_a_change_of_type(kind: DriverKind, por
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     try:
         await driver.connect(10.0)
-        request = asyncio.create_task(driver.set_mode(FlightMode.HOLD))
+        request = asyncio.create_task(driver.set_mode(FlightMode.LAND))
         await autopilot.wait_for_command(mavlink.MAV_CMD_DO_SET_MODE)
         autopilot.mav_type = FIXED_WING
         await wait_for_state(driver, lambda state: state.not_flown is not None)
