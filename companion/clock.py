@@ -15,11 +15,9 @@ from dataclasses import dataclass
 
 # A suspend this short changes no age by more than the lifetime of a setpoint.
 SUSPENDED_S = 0.3
-# A longer pause of the process is a silence. PX4 allows 1 s between setpoints (COM_OF_LOSS_T); a gap of 0.8 s
-# had no effect on a real PX4.
-PAUSED_S = 0.8
-# After a longer pause commands and messages that wait in buffers are too old.
-LONG_S = 3.0
+# After a longer pause of the loop what was decided or received before is too old. Where setpoints are sent, a
+# shorter one ends our command (`companion.vehicle.streamer`). A busy computer may cause one of a second.
+PAUSED_S = 3.0
 _BOOTTIME = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 
@@ -34,17 +32,15 @@ class Standstill:
 
     Attributes:
         why: in words. seconds: for how long.
-        outdated: what was received before is older than it looks.
     """
 
     why: str
     seconds: float
-    outdated: bool
 
     @property
     def long(self) -> bool:
         """Whether a command that arrives now may have been given too long ago."""
-        return self.seconds > LONG_S
+        return self.seconds > PAUSED_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +102,10 @@ class StandstillWatch:
         standstill = None
         if suspended_s > SUSPENDED_S:
             why = f"the computer was suspended for {suspended_s:.1f} s"
-            standstill = Standstill(why, suspended_s, outdated=True)
+            standstill = Standstill(why, suspended_s)
         elif paused_s > PAUSED_S:
             why = f"guidance loop paused for {paused_s:.1f} s"
-            standstill = Standstill(why, paused_s, outdated=paused_s > LONG_S)
+            standstill = Standstill(why, paused_s)
         return Observation(now_ns, offset_ns, standstill)
 
     def acknowledge(self, seen: Observation) -> None:

@@ -182,9 +182,8 @@ class GuidanceLoop:
         self._on_event("warning", f"{standstill.why}: what was commanded before has ended")
         self._requests.abandon_motion(standstill.why)
         self._driver.abandon(standstill.why)
-        if standstill.outdated:
-            self._driver.discard_received()
-            self._inputs.discard_received(now_ns)
+        self._driver.discard_received()
+        self._inputs.discard_received(now_ns)
 
     def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:
         """Warn of a behaviour with a slow update (`before`: the behaviour before the step, if any).

@@ -17,7 +17,6 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 
-from companion.clock import PAUSED_S
 from companion.scheduling import set_scheduler_slice
 from companion.vehicle.precise_sleep import Sleep, precise_sleep
 from companion.vehicle.setpoint import Setpoint
@@ -26,8 +25,9 @@ logger = logging.getLogger(__name__)
 
 DEFAULT_RATE_HZ = 50.0
 DEFAULT_BRAKE_S = 0.5
-# A gap longer than this in a running stream is a silence.
-SILENCE_S = PAUSED_S
+# A gap longer than this in a running stream is a silence. PX4 allows 1 s (COM_OF_LOSS_T); a gap of 0.8 s had
+# no effect on a real PX4.
+SILENCE_S = 0.8
 
 
 class StreamState(StrEnum):

@@ -168,7 +168,7 @@ def test_process_stopped_while_arming_does_not_arm_afterwards(tmp_path: Path) ->
         service.signal(signal.SIGSTOP)
         simulator.fault("end all")
         simulator.wait_for_event("link_loss ends", since=lost)
-        time.sleep(2.0)
+        time.sleep(4.0)
         service.signal(signal.SIGCONT)
         takeoff.join(40.0)
         assert not replies[0]["success"]
