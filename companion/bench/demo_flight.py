@@ -89,7 +89,8 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     flight.run_until(lambda: flight.state.ready_to_arm, 30.0)
     flight.begun_ns = flight.now_ns
     identifier = flight.command(f"mission {MISSION}")
-    flight.tick()
+    # It begins when home is known.
+    flight.run_until(lambda: flight.guidance.busy or flight.outcome(identifier) is not None, 5.0)
     behaviour = flight.guidance.behaviour
     confirmed: str | None = None
     seen: str | None = None

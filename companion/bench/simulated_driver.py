@@ -138,6 +138,7 @@ class SimulatedDriver:
         self._timesyncs_ns: deque[int] = deque(maxlen=TIMESYNCS_KEPT)
         self._answered_ns = 0
         self._pending: list[_Pending] = []
+        self._home_requested = False
         self._answers: list[Answer] = []
         if vehicle.vehicle.gimbal is not None:
             # As the drivers do when a link opens.
@@ -268,6 +269,11 @@ class SimulatedDriver:
                     self._state = apply_message(self._state, name_now, fields, now_ns)
                     if name_now in ("HEARTBEAT", "CURRENT_MODE"):
                         self._changes.on_report(self._state, now_ns, self._answered_ns)
+        state = self._state
+        if state.ready_to_arm and state.home_fault() is not None and not self._home_requested:
+            # As the drivers do while home is unknown: PX4 sends it every two seconds only.
+            self._home_requested = True
+            self.vehicle.send(self._long(dialect.MAV_CMD_REQUEST_MESSAGE, HOME_POSITION_ID))
         for pending in list(self._pending):
             if pending.shown is not None and pending.shown():
                 self._answer(pending, None)
