@@ -94,8 +94,8 @@ class Driver(Protocol):
     async def arm(self, *, since: VehicleState | None = None, valid_until_ns: int | None = None) -> None:
         """Arm, and return when the vehicle reports armed. Raises CommandRefusedError.
 
-        This, `disarm`, `set_mode` and `takeoff` are sent by one state machine (`mode_changes`), one at once:
-        a new one replaces the pending one, which raises CommandRefusedError. They raise TakenOverError as
+        This, `disarm`, `set_mode` and `takeoff` are sent by one state machine (`mode_changes`): a
+        new one replaces the pending one, which raises CommandRefusedError. They raise TakenOverError as
         soon as someone else's change of mode or arming is reported.
 
         Args:

@@ -7,11 +7,11 @@ pilot who has changed the mode in between. The rules:
 1. A change notes the report that it was decided on. It is sent only if that is still the newest report.
 2. It is repeated only if it was lost: no acknowledgement has come, a TIMESYNC that was sent after it has been
    answered, and after that answer the same mode as at the request is reported. A link keeps the order, so
-   then nothing of it is under way; at most one message of a change ever is, whatever the delay. Without
+   then nothing of it is in transit; at most one message of a change ever is, whatever the delay. Without
    TIMESYNC answers, and after the link was lost or the autopilot has restarted, nothing is repeated.
 3. It ends once the wanted mode is reported. Any other report than the one at the request ends it as well:
    someone else has changed the mode, or the autopilot has by itself. An ended change is never repeated.
-4. The one message that is under way when a pilot changes the mode cannot be called back. So a change is
+4. The one message that is in transit when a pilot changes the mode cannot be called back. So a change is
    watched for `IN_FLIGHT_S` after its last message. If another report is followed by an acknowledgement of
    ours and then by the wanted mode, our message has arrived after that change: the mode that was reported
    before is requested again, once, by the same rules. Without that acknowledgement the wanted mode is the
@@ -58,7 +58,7 @@ class Ending(Enum):
 
 @dataclass(eq=False)
 class ModeChange:
-    """One change, from its request until nothing of it can be under way.
+    """One change, from its request until nothing of it can be in transit.
 
     Attributes:
         what: for messages, such as "mode hold".
@@ -187,7 +187,7 @@ class ModeChanges:
             self._on_another(change, state, now_ns)
         elif change.other is None:
             change.shown = True
-            # In that mode already: only the acknowledgement tells that the message has arrived.
+            # In that mode already: only the acknowledgement shows that the message has arrived.
             if change.acknowledged_ns is not None or not change.shows(change.before):
                 self._end(change, Ending.DONE)
         elif last is not None and not change.shows(last):
@@ -201,7 +201,7 @@ class ModeChanges:
             return
         ours = any(mode == state.custom_mode and now_ns <= until for mode, until in self._dropped)
         if ours and change.armed is None and state.armed is change.before.armed:
-            return  # of an earlier change, which was under way
+            return  # of an earlier change, which was in transit
         if not _by_itself(change, state) and not (change.other is not None and _same(change.other, state)):
             change.other, change.arrived_since = state, False
         self._end(change, Ending.TAKEN_OVER, _taken_over(change, state))

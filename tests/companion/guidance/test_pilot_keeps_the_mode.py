@@ -156,7 +156,7 @@ class PilotedFlight:
             vehicle.vehicle.faults.begin(command)
         self.flight.run(2 * self.delay_s + 0.2)
         self.sender.ready(self.flight)
-        # A lost acknowledgement cannot tell that ours has arrived after a change that was not read yet.
+        # A lost acknowledgement cannot show that ours has arrived after a change that was not read yet.
         self.read_at_once = "lost_ack" in commands
         self.reported: list[FlightMode] = []
         self.overridden_s: float | None = None

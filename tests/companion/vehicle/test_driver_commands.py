@@ -14,12 +14,12 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle import flight_commands
-from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
 from companion.vehicle.mavsdk_driver import MavsdkDriver
 from companion.vehicle.state import FlightMode
-from tests.companion.vehicle.fake_autopilot import FakeAutopilot, wait_for_state, wait_until
+from tests.companion.vehicle.fake_autopilot import HOLD, MISSION, FakeAutopilot, wait_for_state, wait_until
 
 pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 
@@ -113,6 +113,50 @@ async def test_unanswered_command_is_repeated_then_fails(driver: Driver, autopil
         await driver.arm()
     attempts = [m.confirmation for m in autopilot.received_named("COMMAND_LONG") if m.command == 400]
     assert len(attempts) >= 3
+
+
+async def test_pilots_mode_ends_the_repetition(driver: Driver, autopilot: FakeAutopilot) -> None:
+    def pilot(message: Any) -> None:
+        if message.command == 176:
+            autopilot.custom_mode = MISSION
+
+    autopilot.answers["COMMAND_LONG"] = pilot
+    with pytest.raises(TakenOverError, match="the pilot took over: mission mode"):
+        await driver.set_mode(FlightMode.LAND, timeout_s=60.0)
+    await driver.settle()
+    assert len([m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]) == 1
+
+
+async def test_pilots_mode_that_ours_overrides_is_requested_again(
+    driver: Driver, autopilot: FakeAutopilot
+) -> None:
+    def late(message: Any) -> None:
+        """It arrives after the pilot's change."""
+        if message.command == 176 and autopilot.custom_mode == HOLD:
+            autopilot.custom_mode = MISSION
+            autopilot.heartbeat()
+        if message.command == 176:
+            autopilot.acknowledge(176)
+            autopilot.custom_mode = int(message.param2) << 16 | int(message.param3) << 24
+            autopilot.heartbeat()
+
+    autopilot.answers["COMMAND_LONG"] = late
+    with pytest.raises(TakenOverError):
+        await driver.set_mode(FlightMode.LAND)
+    await driver.settle()
+    asked = [(m.param2, m.param3) for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
+    assert asked == [(4, 6), (4, 4)]
+    assert driver.state.mode is FlightMode.MISSION
+    assert driver.state.mode_restored
+
+
+async def test_mode_since_the_decision_is_not_overridden(driver: Driver, autopilot: FakeAutopilot) -> None:
+    decided = driver.state
+    autopilot.custom_mode = MISSION
+    await wait_for_state(driver, lambda state: state.mode is FlightMode.MISSION)
+    with pytest.raises(TakenOverError):
+        await driver.set_mode(FlightMode.LAND, since=decided)
+    assert not [m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
 
 
 async def test_command_in_progress_is_not_repeated(driver: Driver, autopilot: FakeAutopilot) -> None:
