@@ -195,10 +195,7 @@ class SimulatedDriver:
             case Arm():
                 self._change(request, ModeChange("arming", ARM_DISARM, (1.0,), state, None, True))
             case Disarm():
-                failure = "the vehicle refused to disarm"
-                self._command(
-                    request, failure, lambda: not self._state.armed, mav.MAV_CMD_COMPONENT_ARM_DISARM, 0.0
-                )
+                self._change(request, ModeChange("disarming", ARM_DISARM, (0.0,), state, None, False))
             case TakeOff(altitude_m):
                 if self._profile.takeoff_needs_home:
                     # Moved by arming, and else sent every two seconds only. The answer comes at once.
