@@ -118,7 +118,7 @@ class ArduPilotProfile(AutopilotProfile):
         mav_type, autopilot = fields.get("type", state.mav_type), fields.get("autopilot", state.mav_autopilot)
         custom_mode: int = fields["custom_mode"]
         if mav_type is not None and autopilot is not None:
-            why = why_not_flown(mav_type, autopilot, state.vtol_state)
+            why = why_not_flown(mav_type, autopilot, state.vtol_state, is_plane=state.is_plane)
             if autopilot != ARDUPILOT or why not in (None, VTOL_STATE_MISSING):
                 return FlightMode.UNKNOWN
         if custom_mode == GUIDED:

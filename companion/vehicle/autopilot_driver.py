@@ -44,7 +44,7 @@ from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleStat
 from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry import Fields
 from companion.vehicle.telemetry_state import TelemetryState
-from companion.vehicle.vehicle_type import ARDUPILOT, PX4
+from companion.vehicle.vehicle_type import ARDUPILOT, COPTER_PARAMETER, PLANE_PARAMETER, PX4
 from companion.vehicle.vision_position import VisionPosition, vision_position_fields
 from vision.obstacle_sectors import ObstacleSectors
 
@@ -206,10 +206,25 @@ class AutopilotDriver(ABC):
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
             await self._choose_address(opened_s)
             await self._attach(max(deadline - time.monotonic(), 1.0))
+            await self._identify()
         except BaseException:
             await self.close()
             raise
         self._start_tasks()
+
+    async def _identify(self) -> None:
+        """Find out whether an ArduPilot that reports a multicopter's type is a quadplane (`vehicle_type`)."""
+        if self._autopilot_kind != ARDUPILOT:
+            return
+        for name, is_plane in ((COPTER_PARAMETER, False), (PLANE_PARAMETER, True)):
+            with contextlib.suppress(CommandRefusedError):
+                await self.get_parameter(name)
+                self._telemetry.state = replace(self._telemetry.state, is_plane=is_plane)
+                return
+        logger.warning(
+            "%s: neither %s nor %s received: its type alone tells that it is Copter",
+            *(self.url, COPTER_PARAMETER, PLANE_PARAMETER),
+        )
 
     def _start_tasks(self) -> None:
         name = self._telemetry.profile.name
@@ -696,6 +711,8 @@ class AutopilotDriver(ABC):
         while True:
             self._telemetry.restarted.clear()
             self.link_count += 1
+            if self.link_count > 1:
+                await self._identify()
             streams.restart()
             self._gimbal_commands.request_search()
             if not await self._wait_silent():

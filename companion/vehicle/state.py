@@ -136,6 +136,7 @@ class VehicleState:
         autopilot: "PX4" or "ArduPilot", None until its first heartbeat.
         mav_type, mav_autopilot: MAV_TYPE and MAV_AUTOPILOT of the newest heartbeat; None until the first.
         vtol_state: None until EXTENDED_SYS_STATE is received.
+        is_plane: an ArduPilot that has a parameter of Plane, whatever type it reports.
         missing_streams: names of required messages received below half of their rate.
         other_commanders: other companion services received on the link, of any age.
         own_address: system and component id of our messages.
@@ -184,6 +185,7 @@ class VehicleState:
     mav_type: int | None = None
     mav_autopilot: int | None = None
     vtol_state: VtolState | None = None
+    is_plane: bool = False
     missing_streams: tuple[str, ...] = ()
     other_commanders: tuple[Commander, ...] = ()
     own_address: Address = (1, 191)
@@ -256,7 +258,7 @@ class VehicleState:
             return (
                 f"the autopilot was {self.autopilot} and is {now} now: another vehicle; restart the service"
             )
-        return why_not_flown(self.mav_type, self.mav_autopilot, self.vtol_state)
+        return why_not_flown(self.mav_type, self.mav_autopilot, self.vtol_state, is_plane=self.is_plane)
 
     def connected(self, now_ns: int) -> bool:
         """Whether a heartbeat was received within `HEARTBEAT_MAX_AGE_S`."""

@@ -10,9 +10,10 @@ in Copter and QSTABILIZE, without throttle, in Plane. So a vehicle that is not l
     every other type                         not flown                         not flown
 
 ArduPilot's quadplanes are vehicles of Plane, whose modes have other numbers, in hover too. They report the
-type that the parameter Q_MAV_TYPE says, by default a fixed wing, but also a quadrotor. Copter's vtol_state is
-always MC (4.7, measured), a quadplane's only in hover: one that claims to be a quadrotor is recognised in
-transition and in forward flight, but not in hover. With ArduPilot no type is known before EXTENDED_SYS_STATE.
+type that the parameter Q_MAV_TYPE says, by default a fixed wing, but also a quadrotor, and in hover the
+vtol_state that Copter always has (MC; 4.7, measured). So the driver asks for a parameter that only Plane has,
+and for one that only Copter has (`PLANE_PARAMETER`, `COPTER_PARAMETER`). With ArduPilot no type is known
+before EXTENDED_SYS_STATE.
 """
 
 from __future__ import annotations
@@ -20,6 +21,9 @@ from __future__ import annotations
 from enum import IntEnum
 
 PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
+# The first that the autopilot answers for tells which program it runs (Rover has FRAME_CLASS too, and a type
+# of its own).
+PLANE_PARAMETER, COPTER_PARAMETER = "Q_ENABLE", "FRAME_CLASS"
 AUTOPILOT_NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}
 
 
@@ -95,12 +99,15 @@ def autopilot_text(autopilot: int) -> str:
     return AUTOPILOT_NAMES.get(autopilot, f"MAV_AUTOPILOT {autopilot}")
 
 
-def why_not_flown(mav_type: int, autopilot: int, vtol_state: VtolState | None) -> str | None:
+def why_not_flown(
+    mav_type: int, autopilot: int, vtol_state: VtolState | None, *, is_plane: bool = False
+) -> str | None:
     """Return why a vehicle gets no flight command, in words; None: it is flown.
 
     Args:
         mav_type, autopilot: MAV_TYPE and MAV_AUTOPILOT of its newest heartbeat.
         vtol_state: of its newest EXTENDED_SYS_STATE; None: none received.
+        is_plane: an ArduPilot that has `PLANE_PARAMETER`.
     """
     what = f"the vehicle is {type_text(mav_type)} of {autopilot_text(autopilot)}"
     if autopilot not in AUTOPILOT_NAMES or mav_type not in MULTICOPTERS | VTOLS:
@@ -108,6 +115,8 @@ def why_not_flown(mav_type: int, autopilot: int, vtol_state: VtolState | None) -
     if autopilot == ARDUPILOT:
         if mav_type in VTOLS:
             return f"{what}: {_FLOWN}"
+        if is_plane:
+            return f"{what} and has the parameter {PLANE_PARAMETER}, so it is a quadplane: {_FLOWN}"
         if vtol_state is None:
             return VTOL_STATE_MISSING
         if vtol_state not in (VtolState.UNDEFINED, VtolState.MC):

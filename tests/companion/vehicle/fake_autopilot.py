@@ -28,6 +28,7 @@ class FakeAutopilot:
     Attributes:
         received: (decoded message, raw frame) in the order of arrival.
         answers: message name → called with every received message of that name.
+        parameters: those that it has.
     """
 
     def __init__(self, port: int, *, system_id: int = 1, component_id: int = 1, autopilot: int = 12) -> None:
@@ -35,7 +36,9 @@ class FakeAutopilot:
         self.answers: dict[str, Callable[[Any], None]] = {
             "COMMAND_LONG": lambda m: self.acknowledge(m.command, to=sender_of(m)),
             "TIMESYNC": lambda m: self.send(mavlink.MAVLink_timesync_message(time.monotonic_ns(), m.ts1)),
+            "PARAM_REQUEST_READ": lambda m: self.parameter(m.param_id),
         }
+        self.parameters = {"FRAME_CLASS": 1.0} if autopilot == mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA else {}
         self.custom_mode, self.base_mode, self.system_status = HOLD, 29, 3
         self.autopilot, self.mav_type, self.vtol_state = autopilot, 2, 0
         self.sends_heartbeats = True
@@ -69,6 +72,12 @@ class FakeAutopilot:
 
     def acknowledge(self, command: int, result: int = 0, *, to: tuple[int, int] = (1, 191)) -> None:
         self.send(mavlink.MAVLink_command_ack_message(command, result, 0, 0, *to))
+
+    def parameter(self, name: str) -> None:
+        """Send one of `parameters`; nothing where there is none, as ArduPilot does."""
+        if name in self.parameters:
+            value, real32 = self.parameters[name], mavlink.MAV_PARAM_TYPE_REAL32
+            self.send(mavlink.MAVLink_param_value_message(name.encode(), value, real32, 1, 0))
 
     def home(self, altitude_amsl_m: float = 488.0) -> None:
         altitude = round(altitude_amsl_m * 1000)

@@ -17,6 +17,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.vehicle_type import VtolState
 from mavlink_sim.testing import RunningSimulator, free_port, vehicle
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
@@ -183,6 +184,26 @@ async def test_messages_sent_to_ardupilot() -> None:
         heartbeat = (await autopilot.wait_for("HEARTBEAT"))[-1]
         assert mark.name == "companion"
         assert mark.value & 0xFFFF_FFFF == heartbeat.custom_mode
+    finally:
+        await driver.close()
+        await autopilot.stop()
+
+
+async def test_quadplane_that_reports_a_quadrotor_is_not_flown() -> None:
+    port = free_port()
+    autopilot = FakeAutopilot(port, autopilot=3)
+    autopilot.vtol_state, autopilot.parameters = mavlink.MAV_VTOL_STATE_MC, {"Q_ENABLE": 1.0}
+    autopilot.start()
+    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}")
+    try:
+        await driver.connect(10.0)
+        autopilot.landed(mavlink.MAV_LANDED_STATE_IN_AIR)
+        await wait_for_state(driver, lambda state: state.vtol_state is VtolState.MC)
+        assert driver.state.is_plane
+        assert driver.state.not_flown is not None
+        with pytest.raises(CommandRefusedError):
+            await driver.set_mode(FlightMode.HOLD)  # 17: QSTABILIZE
+        assert not [m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
     finally:
         await driver.close()
         await autopilot.stop()

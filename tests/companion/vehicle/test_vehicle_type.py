@@ -123,12 +123,11 @@ def test_quadplane_of_ardupilot_is_never_flown(mav_type: int, vtol_state: VtolSt
     assert why_not_flown(mav_type, ARDUPILOT, vtol_state) is not None
 
 
-def test_quadplane_that_claims_to_be_a_quadrotor_is_flown_in_hover_at_most() -> None:
+def test_quadplane_that_claims_to_be_a_quadrotor_is_never_flown() -> None:
     assert why_not_flown(QUADROTOR, ARDUPILOT, None) == VTOL_STATE_MISSING
     for vtol_state in VtolState:
-        # In hover it cannot be distinguished from Copter, which always reports MC.
-        flies = vtol_state in (UNDEFINED, MC)
-        assert (why_not_flown(QUADROTOR, ARDUPILOT, vtol_state) is None) is flies
+        assert (why_not_flown(QUADROTOR, ARDUPILOT, vtol_state) is None) is (vtol_state in (UNDEFINED, MC))
+        assert why_not_flown(QUADROTOR, ARDUPILOT, vtol_state, is_plane=True) is not None
 
 
 def test_unknown_vtol_state_is_none(kind: DriverKind) -> None:
