@@ -1,6 +1,7 @@
-"""Queue of commands: one that needs a gimbal or home waits until that is known.
+"""Queue of commands: one that needs a gimbal, home or detections waits for the first report of it.
 
-The gimbal manager is asked; PX4 sends home every two seconds.
+The gimbal manager is asked; PX4 sends home every two seconds; a camera that has just started sends its first
+detections within seconds.
 
 A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
 battery, or the end of the service.
@@ -41,24 +42,23 @@ class CommandQueue:
     def add(
         self,
         command: CommandInput,
-        now_ns: int,
-        state: VehicleState,
+        context: BehaviourContext,
         gimbal_user: str,
         out: OutputCollector,
     ) -> None:
         """Add a new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none."""
         self.supersede(command.text, out)
         if command.mode_changes not in (None, self._mode_changes):
-            out.result(command.identifier, Outcome(False, f"superseded by {_change(state)}"))
+            out.result(command.identifier, Outcome(False, f"superseded by {_change(context.state)}"))
             return
         if command.aim is not None and gimbal_user:
             reason = f"gimbal: in use by {gimbal_user}; end that behaviour first"
             out.result(command.identifier, Outcome(False, reason))
             return
-        if not (awaited := _awaited(command, state, now_ns)):
+        if not (awaited := _awaited(command, context)):
             self._due.append(command)
             return
-        self._waiting.append(_Waiting(command, now_ns + FIND_TIMEOUT_S * 1e9, awaited))
+        self._waiting.append(_Waiting(command, context.now_ns + FIND_TIMEOUT_S * 1e9, awaited))
         if awaited == _GIMBAL:
             self._gimbal.find(out)
 
@@ -91,7 +91,7 @@ class CommandQueue:
         now_ns = context.now_ns
         due, left = list[CommandInput](), list[_Waiting]()
         for waiting in self._waiting:
-            awaited = _awaited(waiting.command, context.state, now_ns)
+            awaited = _awaited(waiting.command, context)
             found = not awaited or (awaited == _GIMBAL and self._gimbal.not_found)
             if found or now_ns > waiting.until_ns:
                 due.append(waiting.command)
@@ -105,15 +105,19 @@ class CommandQueue:
         return [command for command in due if command.behaviour is not None]
 
 
-def _awaited(command: CommandInput, state: VehicleState, now_ns: int) -> str:
+def _awaited(command: CommandInput, context: BehaviourContext) -> str:
     """What the command waits for, in words; empty: nothing."""
     behaviour = command.behaviour
     needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.requirements)
     for later in () if behaviour is None else behaviour.later:
         needed |= later.requirements
-    if Requirement.GIMBAL in needed and not is_known(state.gimbal, now_ns):
+    if Requirement.GIMBAL in needed and not is_known(context.state.gimbal, context.now_ns):
         return _GIMBAL
-    return "home" if Requirement.HOME in needed and state.home_fault() is not None else ""
+    if Requirement.HOME in needed and context.state.home_fault() is not None:
+        return "home"
+    if Requirement.PERCEPTION in needed and context.perception_age_s is None:
+        return "the first detections"
+    return ""
 
 
 def _change(state: VehicleState) -> str:

@@ -202,7 +202,7 @@ class Guidance:
             if (why := self._outdated(command, inputs.standstill, now_ns)) is not None:
                 out.result(command.identifier, Outcome(False, why))
                 continue
-            self._queue.add(command, now_ns, inputs.state, self._runner.gimbal_user, out)
+            self._queue.add(command, context, self._runner.gimbal_user, out)
         for command in self._queue.take_due(context, out):
             self._begin_command(command, context)
         landing_target = None

@@ -72,9 +72,22 @@ def test_seek_is_refused_without_fresh_perception(age_s: float | None) -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = age_s
     harness.run(0.1)
-    reason = harness.command(SeekBehaviour("car")).result().reason
+    reason = harness.outcome(harness.command(SeekBehaviour("car")), 5.0).reason
     assert "perception" in reason
     assert ("2.0 s old" if age_s else "no detections") in reason
+
+
+def test_seek_waits_for_the_first_detections() -> None:
+    harness = GuidanceHarness(flying())
+    harness.perception_age_s = None
+    harness.run(0.1)
+    future = harness.command(SeekBehaviour("car"))
+    harness.run(3.0)
+    assert not future.done()
+    assert not harness.guidance.in_command
+    harness.perception_age_s = 0.1
+    harness.run(0.5)
+    assert harness.guidance.phase == "offboard"
 
 
 def test_late_detector_allows_seek_but_does_not_steer_it() -> None:

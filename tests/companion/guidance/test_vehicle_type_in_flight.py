@@ -20,9 +20,11 @@ from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_fa
 FIXED_WING, QUADROTOR, ROVER, TILTROTOR = 1, 2, 10, 21
 Identity = tuple[str, int, int, VtolState]
 HOVERING: Identity = ("PX4", TILTROTOR, PX4, VtolState.MC)
+QUADPLANE: Identity = ("ArduPilot", QUADROTOR, ARDUPILOT, VtolState.MC)
 NOT_FLOWN: list[Identity] = [
+    QUADPLANE,  # in hover, with Q_MAV_TYPE 2
     ("ArduPilot", FIXED_WING, ARDUPILOT, VtolState.MC),  # a quadplane
-    ("ArduPilot", QUADROTOR, ARDUPILOT, VtolState.MC),  # one with Q_MAV_TYPE 2
+    ("ArduPilot", QUADROTOR, ARDUPILOT, VtolState.FW),  # the same in forward flight
     ("ArduPilot", ROVER, ARDUPILOT, VtolState.UNDEFINED),
     ("PX4", FIXED_WING, PX4, VtolState.UNDEFINED),
     ("PX4", QUADROTOR, ARDUPILOT, VtolState.UNDEFINED),  # another vehicle on the same link
@@ -43,6 +45,8 @@ class Vehicle(GuidanceHarness):
         state = replace(
             inputs.state, autopilot=name, mav_type=mav_type, mav_autopilot=autopilot, vtol_state=vtol_state
         )
+        # Plane's parameter tells the one that hovers from Copter.
+        state = replace(state, is_plane=self.identity is QUADPLANE)
         return replace(inputs, state=state)
 
 
