@@ -16,14 +16,15 @@ from tests.companion.vehicle.fake_autopilot import OFFBOARD, SETPOINT, FakeAutop
 from tests.companion.vehicle.test_vehicle_type import ALLOWED_COMMANDS
 
 pytestmark = pytest.mark.realtime
-FIXED_WING, QUADROTOR, VTOL_MC = 1, 2, 3
+FIXED_WING, QUADROTOR = 1, 2
+MC, FW = 3, 4  # MAV_VTOL_STATE
 
 
 @pytest.mark.parametrize(
     ("kind", "autopilot", "mav_type"),
     [
         ("pymavlink", 3, FIXED_WING),
-        ("pymavlink", 3, QUADROTOR),  # a quadplane that claims to be one
+        ("pymavlink", 3, QUADROTOR),  # a quadplane that claims to be one, in forward flight
         ("pymavlink", 12, FIXED_WING),
         ("mavsdk", 12, FIXED_WING),
     ],
@@ -31,7 +32,9 @@ FIXED_WING, QUADROTOR, VTOL_MC = 1, 2, 3
 async def test_plane_gets_no_mode_no_arming_and_one_line(kind: str, autopilot: int, mav_type: int) -> None:
     port = free_port()
     plane = FakeAutopilot(port, autopilot=autopilot)
-    plane.mav_type, plane.vtol_state, plane.base_mode = mav_type, VTOL_MC, 29 | 128
+    plane.mav_type, plane.vtol_state, plane.base_mode = mav_type, MC, 29 | 128
+    if mav_type == QUADROTOR:
+        plane.vtol_state = FW
     plane.start()
     flight = LiveFlight(kind, port)
     try:
