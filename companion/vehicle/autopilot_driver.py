@@ -222,7 +222,7 @@ class AutopilotDriver(ABC):
                 self._telemetry.state = replace(self._telemetry.state, is_plane=is_plane)
                 return
         logger.warning(
-            "%s: neither %s nor %s received: its type alone tells that it is Copter",
+            "%s: neither %s nor %s received: by its type alone it is taken for Copter",
             *(self.url, COPTER_PARAMETER, PLANE_PARAMETER),
         )
 

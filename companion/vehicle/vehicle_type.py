@@ -21,7 +21,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
-# The first that the autopilot answers for tells which program it runs (Rover has FRAME_CLASS too, and a type
+# The one that the autopilot answers for shows which program it runs (Rover has FRAME_CLASS too, and a type
 # of its own).
 PLANE_PARAMETER, COPTER_PARAMETER = "Q_ENABLE", "FRAME_CLASS"
 AUTOPILOT_NAMES = {PX4: "PX4", ARDUPILOT: "ArduPilot"}

@@ -45,7 +45,7 @@ class Vehicle(GuidanceHarness):
         state = replace(
             inputs.state, autopilot=name, mav_type=mav_type, mav_autopilot=autopilot, vtol_state=vtol_state
         )
-        # Plane's parameter tells the one that hovers from Copter.
+        # Plane's parameter distinguishes the one that hovers from Copter.
         state = replace(state, is_plane=self.identity is QUADPLANE)
         return replace(inputs, state=state)
 
