@@ -111,6 +111,20 @@ def test_every_parameter_that_the_sitl_tests_set_is_documented() -> None:
     assert not {name for name in names if f"`{name}`" not in listed}
 
 
+def test_every_promise_of_safety_names_a_test_that_exists() -> None:
+    safety = (ROOT / "docs" / "safety.md").read_text()
+    promises = safety.partition("## Which test holds which promise")[2].partition("\n## ")[0]
+    rows = [line for line in promises.splitlines() if line.startswith("| ") and "`" in line]
+    assert len(rows) > 20
+    for row in rows:
+        named = re.findall(r"`([\w/]+\.py)::(test_\w+)`", row)
+        assert named, row
+        for path, test in named:
+            files = [folder / path for folder in (ROOT / "tests", ROOT / "tests" / "companion")]
+            texts = [file.read_text() for file in files if file.exists()]
+            assert any(f"def {test}(" in text for text in texts), (path, test)
+
+
 def test_index_lists_every_document() -> None:
     index = (ROOT / "docs" / "README.md").read_text()
     pages = {path.relative_to(ROOT / "docs").as_posix() for path in (ROOT / "docs").glob("**/*.md")}

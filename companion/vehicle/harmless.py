@@ -23,7 +23,7 @@ _MESSAGES = frozenset(
         REQUEST_EVENT_ID,
     }
 )
-_COMMANDS = frozenset(
+COMMANDS = frozenset(
     {
         511,  # SET_MESSAGE_INTERVAL
         512,  # REQUEST_MESSAGE
@@ -39,5 +39,5 @@ def is_harmless(frame: Frame) -> bool:
     """Whether a frame of ours may go to any vehicle."""
     if frame.message_id in (_COMMAND_LONG_ID, _COMMAND_INT_ID):
         command = frame.padded(_COMMAND_END)[_COMMAND_AT:_COMMAND_END]
-        return int.from_bytes(command, "little") in _COMMANDS
+        return int.from_bytes(command, "little") in COMMANDS
     return frame.message_id in _MESSAGES

@@ -76,7 +76,8 @@ class AutopilotLink:
         service_port: the service listens there. address: where the autopilot's messages arrive.
         cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
         uplink_deaf: what the service sends is not passed on while it is true; it is still recorded.
-        autopilot, system_id: MAV_AUTOPILOT of its first heartbeat, and who sent it; None and 0 before.
+        autopilot, vehicle_type, system_id: MAV_AUTOPILOT and MAV_TYPE of its heartbeat, and who sent it; None
+            and 0 before.
         version: major and minor of its AUTOPILOT_VERSION; (0, 0) before.
         modes: (time_s, custom_mode) of every change.
         poses, setpoints_s: everything since the start; when each setpoint of the service came.
@@ -96,7 +97,7 @@ class AutopilotLink:
         self.service_port, self.address = free_port(), url.address
         self.cut = self.uplink_deaf = False
         self.autopilot: int | None = None
-        self.system_id = 0
+        self.system_id = self.vehicle_type = 0
         self.version = (0, 0)
         self.modes: list[tuple[float, int]] = []
         self.poses: list[Pose] = []
@@ -374,6 +375,7 @@ class AutopilotLink:
             case "HEARTBEAT":
                 self._heartbeat_s = now_s
                 self.autopilot, self.system_id = message.autopilot, message.get_srcSystem()
+                self.vehicle_type = message.type
                 self.armed = bool(message.base_mode & _ARMED)
                 self._note_mode(message.custom_mode, now_s)
             case "AUTOPILOT_VERSION":
