@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -353,6 +354,17 @@ def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
         read_source(batch)
 
 
+def denied_for(name: str, read: Callable[..., Any]) -> Callable[..., Any]:
+    """The reading function of paths, which may not read files of this name."""
+
+    def reads(path: Path, *arguments: Any, **options: Any) -> Any:
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return read(path, *arguments, **options)
+
+    return reads
+
+
 @pytest.mark.parametrize(
     ("content", "expected"),
     [
@@ -371,12 +383,9 @@ def test_unusable_names_beside_are_refused_with_their_file(
     path = constant_onnx(Path("rel.onnx"), outputs)
     Path("rel.txt").write_bytes(content or b"a\nb\n")
 
-    def denied(*_: Any, **__: Any) -> bytes:
-        raise PermissionError(13, "Permission denied")
-
     if content is None:
-        monkeypatch.setattr(Path, "read_bytes", denied)
-        monkeypatch.setattr(Path, "read_text", denied)
+        for name in ("read_bytes", "read_text"):
+            monkeypatch.setattr(Path, name, denied_for("rel.txt", getattr(Path, name)))
     with pytest.raises(RuntimeUnusableError, match=expected) as caught:
         read_source(path)
     assert str(caught.value).startswith("rel.txt: ")
