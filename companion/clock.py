@@ -18,6 +18,8 @@ SUSPENDED_S = 0.3
 # After a longer pause of the loop what was decided or received before is too old. Where setpoints are sent, a
 # shorter one ends our command (`companion.vehicle.streamer`). A busy computer may cause one of a second.
 PAUSED_S = 3.0
+# What waited in this computer's buffers arrives at once. Linux repeats a TCP segment after 120 s at most.
+BUFFERED_S, LATEST_S = 1.0, 120.0
 _BOOTTIME = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 
 
@@ -32,15 +34,23 @@ class Standstill:
 
     Attributes:
         why: in words. seconds: for how long.
+        suspended: the computer did, and its network: a sender's TCP repeats what was not received, after a
+            time that doubles, so it may arrive as long after the end as the suspend lasted.
     """
 
     why: str
     seconds: float
+    suspended: bool = False
 
     @property
     def long(self) -> bool:
         """Whether a command that arrives now may have been given too long ago."""
         return self.seconds > PAUSED_S
+
+    @property
+    def late_commands_s(self) -> float:
+        """How long after its end commands from before it may arrive, seconds."""
+        return min(max(self.seconds, BUFFERED_S), LATEST_S) if self.suspended else BUFFERED_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +112,7 @@ class StandstillWatch:
         standstill = None
         if suspended_s > SUSPENDED_S:
             why = f"the computer was suspended for {suspended_s:.1f} s"
-            standstill = Standstill(why, suspended_s)
+            standstill = Standstill(why, suspended_s, suspended=True)
         elif paused_s > PAUSED_S:
             why = f"guidance loop paused for {paused_s:.1f} s"
             standstill = Standstill(why, paused_s)

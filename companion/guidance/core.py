@@ -15,7 +15,7 @@ import logging
 import math
 from dataclasses import dataclass, replace
 
-from companion.clock import Standstill
+from companion.clock import BUFFERED_S, Standstill
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviour_runner import BehaviourRunner
 from companion.guidance.behaviours.land import LandBehaviour
@@ -47,8 +47,6 @@ from vision.occupancy_grid import Point
 logger = logging.getLogger(__name__)
 
 OBSTACLE_DISTANCE_PERIOD_NS = 100_000_000
-# After a long standstill commands that waited in buffers arrive within this time.
-REFUSE_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,18 +237,26 @@ class Guidance:
         self._runner.end_after_standstill(standstill.why)
         self._tracks = RecentTracks(max_age_s=self._options.track_max_age_s)
         if standstill.long:
-            self._standstill, self._refuse_until_ns = standstill, now_ns + REFUSE_NS
+            self._standstill = standstill
+            self._refuse_until_ns = now_ns + round(standstill.late_commands_s * 1e9)
 
     def _outdated(self, command: CommandInput, standstill: Standstill | None, now_ns: int) -> str | None:
         """Why a command is refused that may be from before a standstill; None: it is not.
 
-        A command that was sent to a process that stands still waits in a buffer, and arrives when it goes on.
+        A command that was sent to a process that stands still waits in a buffer, and arrives when it goes on;
+        one that was sent to a suspended computer is sent again by its sender's TCP.
         """
         if isinstance(command.behaviour, StopBehaviour | LandBehaviour):
             return None
         if standstill is None and now_ns < self._refuse_until_ns:
             standstill = self._standstill
-        return None if standstill is None else f"{standstill.why}: give the command again"
+        if standstill is None:
+            return None
+        left_s = max(self._refuse_until_ns - now_ns, 0) / 1e9
+        again = (
+            f"give the command again in {left_s:.0f} s" if left_s > BUFFERED_S else "give the command again"
+        )
+        return f"{standstill.why}, and this command may be from before: {again}"
 
     def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
         """The input of behaviours, without targets that are too old or whose camera direction is unknown."""

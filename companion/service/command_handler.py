@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from companion.bus.command_intake import Allowance
+from companion.clock import boottime_ns
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.select import Select
 from companion.guidance.behaviours.stop import StopBehaviour
@@ -116,7 +117,7 @@ class CommandHandler:
             return self._read(identifier, text)
         if self._reading:
             raise GrammarError(f"{kind.word}: another file is being read")
-        self._reading = True
+        self._reading, begun_ns = True, boottime_ns()
         try:
             async with asyncio.timeout(READING_S):
                 command = await asyncio.to_thread(self._read, identifier, text)
@@ -124,6 +125,9 @@ class CommandHandler:
             raise GrammarError(f"{kind.word}: its file was not read within {READING_S:g} s") from None
         finally:
             self._reading = False
+        # The time-out does not count a suspend.
+        if boottime_ns() - begun_ns > (READING_S + 1.0) * 1e9:
+            raise GrammarError(f"{kind.word}: the computer stood still while its file was read")
         if self._newest > identifier or self._closed:
             raise GrammarError(f"{kind.word}: superseded while its file was read")
         return command

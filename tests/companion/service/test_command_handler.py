@@ -155,3 +155,14 @@ async def test_mission_that_is_read_at_the_end_is_not_flown() -> None:
     handler.release.set()
     assert not (await mission)["success"]
     assert handler.take_commands() == ()
+
+
+async def test_mission_that_is_read_across_a_suspend_is_not_flown(monkeypatch: pytest.MonkeyPatch) -> None:
+    handler, suspended_ns = ReadingHandler(), [0]
+    monkeypatch.setattr(command_handler, "boottime_ns", lambda: suspended_ns[0])
+    mission = asyncio.create_task(handler.execute("mission far"))
+    await asyncio.to_thread(handler.begun.wait, 20)
+    suspended_ns[0] = 30_000_000_000
+    handler.release.set()
+    assert not (await mission)["success"]
+    assert handler.take_commands() == ()
