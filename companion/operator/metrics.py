@@ -6,13 +6,9 @@ loop.
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
-from socketserver import ThreadingMixIn
 from typing import TYPE_CHECKING, Any
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer, make_server
 
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
@@ -22,53 +18,6 @@ Status = Mapping[str, Any]
 
 class MetricsError(RuntimeError):
     """The endpoint cannot be opened. The message is one line."""
-
-
-MAX_CONNECTIONS = 8
-"""Each has a thread; of more, the oldest is closed."""
-
-
-class _Handler(WSGIRequestHandler):
-    timeout = 5.0  # of each read, seconds
-
-    def log_message(self, format: str, *args: object) -> None:
-        """Log nothing."""
-
-
-class _Server(ThreadingMixIn, WSGIServer):
-    """A server whose silent clients cannot fill the service's process with threads."""
-
-    daemon_threads = True
-    request_queue_size = 128
-
-    def server_bind(self) -> None:
-        self._open: dict[socket.socket, None] = {}
-        self._lock = threading.Lock()
-        super().server_bind()
-
-    def process_request(self, request: Any, client_address: Any) -> None:
-        with self._lock:
-            self._open[request] = None
-            oldest = next(iter(self._open)) if len(self._open) > MAX_CONNECTIONS else None
-            if oldest is not None:
-                del self._open[oldest]
-        if oldest is not None:
-            with suppress(OSError):  # it has just ended
-                oldest.shutdown(socket.SHUT_RDWR)
-        super().process_request(request, client_address)
-
-    def shutdown_request(self, request: Any) -> None:
-        with self._lock:
-            self._open.pop(request, None)
-        super().shutdown_request(request)
-
-
-class _Server6(_Server):
-    address_family = socket.AF_INET6
-
-
-def _server_of(host: str) -> type[_Server]:
-    return _Server6 if ":" in host else _Server
 
 
 class MetricsServer:
@@ -86,6 +35,9 @@ class MetricsServer:
     def __init__(self, listen: str, snapshot: Callable[[], Status | None]) -> None:
         try:
             from prometheus_client import CollectorRegistry, make_wsgi_app
+
+            # With http.client it takes longer to import than the rest here.
+            from companion.operator.wsgi_server import open_server
         except ImportError as error:
             raise MetricsError(
                 "metrics.listen needs prometheus_client: pip install 'mavlink-companion[metrics]'"
@@ -94,7 +46,7 @@ class MetricsServer:
         registry = CollectorRegistry()
         registry.register(_Collector(snapshot))
         try:
-            self._server = make_server(host, int(port), make_wsgi_app(registry), _server_of(host), _Handler)
+            self._server = open_server(host, int(port), make_wsgi_app(registry))
         except (OSError, OverflowError) as error:
             raise MetricsError(f"metrics cannot be served on {listen}: {error}") from error
         self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)

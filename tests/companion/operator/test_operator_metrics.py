@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
-from companion.operator.metrics import MAX_CONNECTIONS, MetricsError, MetricsServer
+from companion.operator.metrics import MetricsError, MetricsServer
+from companion.operator.wsgi_server import MAX_CONNECTIONS
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
 
