@@ -78,8 +78,8 @@ class LiveFlight:
 
     @contextlib.asynccontextmanager
     async def running(self) -> AsyncIterator[None]:
-        await self.driver.connect(20.0)
         unsubscribe = self.driver.subscribe(self.inputs.on_state)
+        await self.driver.connect(20.0)
         tasks = [asyncio.create_task(self.loop.run()), asyncio.create_task(self.streamer.run())]
         try:
             yield
