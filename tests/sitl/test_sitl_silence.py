@@ -68,7 +68,8 @@ def test_silence_does_what_the_service_says(
         return
     assert mode_of_custom_mode(shown).value == said["mode"], said
     assert left_s is not None
-    assert left_s == pytest.approx(said["after_s"], abs=0.4)
+    late_s = 0.0 if link.version >= (1, 15) else 1.0  # without CURRENT_MODE, HEARTBEAT shows it once a second
+    assert -0.4 < left_s - said["after_s"] < 0.4 + late_s
     effect = SilenceEffect(said["effect"])
     assert said["warning"] is (effect is SilenceEffect.SINK)
     if effect in (SilenceEffect.SINK, SilenceEffect.LAND):
