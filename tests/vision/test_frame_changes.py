@@ -63,6 +63,33 @@ def test_unknown_depth_everywhere_is_no_repetition() -> None:
     assert changes.repeated["depth"] == 0
 
 
+def untextured(kind: str) -> np.ndarray:
+    shown = np.zeros((480, 64, 3), np.uint8)
+    if kind == "sky":
+        shown[:] = np.linspace(230, 120, 480, dtype=np.uint8)[:, None, None]
+    elif kind == "level horizon":
+        shown[:240], shown[240:] = (178, 178, 178), (90, 110, 80)
+    elif kind == "night with a lamp":
+        shown[300:308, 40:44] = 255
+    return shown
+
+
+@pytest.mark.parametrize("kind", ["black", "sky", "level horizon", "night with a lamp"])
+def test_image_without_texture_is_no_repetition(kind: str) -> None:
+    changes, shown = FrameChanges(), untextured(kind)
+    stamps = [changes.stamped(Frame(shown, n, n)).image_since_ns for n in (1, 2, 3)]
+    assert stamps == [1, 2, 3]
+    assert changes.repeated["image"] == 0
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_clipped_image_with_some_texture_is_a_repetition(share: float) -> None:
+    changes, shown = FrameChanges(), image(0)
+    shown[round(share * len(shown)) :] = 0
+    stamps = [changes.stamped(Frame(shown, n, n)).image_since_ns for n in (1, 2, 3)]
+    assert stamps == [1, 1, 1]
+
+
 def test_another_size_is_a_new_image() -> None:
     changes = FrameChanges()
     changes.stamped(Frame(np.zeros((48, 64, 3), np.uint8), 1, 0))
