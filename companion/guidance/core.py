@@ -87,6 +87,7 @@ class Guidance:
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
         self._closing = ClosingCheck()
+        self._approaching: Behaviour | None = None
         self._context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
@@ -300,6 +301,9 @@ class Guidance:
         known, position = self._closing.fault, state.position_ned_m
         if known or position is None:
             return known
+        if self._runner.active is not self._approaching:  # the next step of a mission: another object
+            self._approaching = self._runner.active
+            self._closing.begin_again()
         fault = self._closing.update(self._runner.approached, targets, state.position_ns, position)
         if fault and (behaviour := self._runner.behaviour) is not None:
             self._out.event(EventKind.NOTED, behaviour.name, fault, warning=True)

@@ -73,9 +73,10 @@ class ClosingCheck:
         self._frame_ns = self._same_frames = 0
         # The first frame with the boxes of the newest, and where the vehicle was.
         self._same: tuple[tuple[Target, ...], Vector3] = ((), (0.0, 0.0, 0.0))
-        self._restart()
+        self.begin_again()
 
-    def _restart(self) -> None:
+    def begin_again(self) -> None:
+        """Another object is approached: its distance is not compared with those before. The fault stays."""
         self._blocks: deque[_Sample] = deque(maxlen=BLOCKS)
         self._samples: list[_Sample] = []
         self._last: tuple[Target, Vector3] | None = None
@@ -91,7 +92,8 @@ class ClosingCheck:
         """Add the newest detections and the vehicle's position; returns `fault`.
 
         Args:
-            approached: a detection that is not newer than the one before changes nothing.
+            approached: a detection that is not newer than the one before changes nothing. None: none, and the
+                next one may be another object.
             targets: of the newest frame; one that was added before changes nothing.
             position_ns, position: its stamp, and local NED metres.
         """
@@ -101,6 +103,8 @@ class ClosingCheck:
         if not self.fault and boxed and boxed[0].captured_ns > self._frame_ns:
             self._frame_ns = boxed[0].captured_ns
             self._compare_boxes(boxed)
+        if approached is None:
+            self.begin_again()
         if approached is None or self.fault:
             return self.fault
         seen, last = approached.seen, self._last
@@ -109,7 +113,7 @@ class ClosingCheck:
         there = self._position_at(seen.captured_ns)
         distance_m, line, sigma_m = _measured(seen, there, vertical=approached.moves)
         if last is None or not _continues(last[0], seen):
-            self._restart()
+            self.begin_again()
         else:
             step = [now - before for now, before in zip(there, last[1], strict=True)]
             self._flown_m += sum(part * along for part, along in zip(step, line, strict=True))
@@ -163,7 +167,7 @@ def _are_same(one: Sequence[Target], other: Sequence[Target]) -> bool:
 def _continues(last: Target, seen: Target) -> bool:
     """Whether two distances can be compared: to the same point, by the same means, without a long gap."""
     gap_s = (seen.captured_ns - last.captured_ns) / 1e9
-    means, before = ((each.class_name, each.range_source, each.cut) for each in (seen, last))
+    means, before = ((t.class_name, t.track_id, t.range_source, t.cut) for t in (seen, last))
     return gap_s <= GAP_S and means == before
 
 

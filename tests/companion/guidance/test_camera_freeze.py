@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -17,12 +17,15 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Outcome
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from tests.companion.guidance.guidance_harness import in_the_air
 from vision.camera_model import CameraModel, CameraMount
+from vision.tracking import TrackerSettings
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-10.0))
@@ -124,6 +127,29 @@ def test_no_behaviour_flies_on_with_a_frozen_camera(name: str, fault: str, seed:
         assert freeze.flown_m <= MAX_FLOWN_M[fault], freeze
     if fault == EXACT and not reached:
         assert freeze.named, freeze
+
+
+# --- no false alarm
+
+
+@pytest.mark.parametrize("tracker", [TrackerSettings(), None], ids=["tracks", "no tracks"])
+def test_mission_approaches_two_persons_of_one_class(tracker: TrackerSettings | None) -> None:
+    first_s = 4.0
+    # The seconds count from the command, before it from the start.
+    begun: list[LockstepFlight] = []
+    near = replace(person_at(14.0), hidden=lambda seconds: bool(begun) and seconds > first_s - 0.5)
+    seen = Faults(missed=0.0, false_per_frame=0.0)
+    detector = SyntheticDetector([near, person_at(22.0, -1.0)], CAMERA, MOUNT, seed=1, faults=seen)
+    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector, tracker=tracker)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    flight.turn_to(0.0)
+    approach = f'[[step]]\ndo = "approach person distance={DISTANCE_M:g} speed={SPEED_MPS:g} retries=0"\n'
+    text = f"{approach}timeout_s = {first_s}\non_failure = 'continue'\n{approach}"
+    mission = SequenceBehaviour(plan_from(text, "test.toml"), flight.guidance.check_requirements)
+    outcome = flight.fly(mission, 60.0, on_tick=lambda: begun.append(flight)).outcome
+    assert outcome is not None
+    assert [record.success for record in mission.records] == [False, True]
+    assert not any("camera frozen" in event.message for event in flight.events)
 
 
 # --- markers: drawn, so that the images themselves are identical or not

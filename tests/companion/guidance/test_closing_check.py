@@ -16,7 +16,13 @@ HEIGHT_M = 4.0
 
 
 def seen_at(
-    stamp_ns: int, north_m: float, *, sigma_m: float = 0.2, box_px: float = 0.0, cut: bool = False
+    stamp_ns: int,
+    north_m: float,
+    *,
+    sigma_m: float = 0.2,
+    box_px: float = 0.0,
+    cut: bool = False,
+    track_id: int | None = None,
 ) -> Target:
     """An object on the ground `north_m` ahead, with a box that is `box_px` beside its place."""
     box = (300.0 + box_px, 200.0, 340.0 + box_px, 300.0)
@@ -30,6 +36,7 @@ def seen_at(
         range_source=RangeSource.GROUND_PLANE,
         position_ned_m=(north_m, 0.0, 0.0),
         box_xyxy=box,
+        track_id=track_id,
         distance_m=math.hypot(north_m, HEIGHT_M),
         distance_sigma_m=sigma_m,
         cut=cut,
@@ -122,3 +129,28 @@ def test_an_object_that_moves_is_compared_by_height_alone() -> None:
         )
         check.update(Approached(below, moves=True), (), stamp_ns, (0.0, 0.0, down_m))
     assert "marker 7" in check.fault
+
+
+@pytest.mark.parametrize("between", ["another track", "none for a moment", "another behaviour"])
+def test_distances_of_two_objects_are_not_compared(between: str) -> None:
+    check = ClosingCheck()
+    for number in range(120):
+        stamp_ns, north_m = 10**9 + number * PERIOD_NS, 0.1 * number
+        second = number >= 40
+        track_id = 2 if second and between == "another track" else 1
+        place_m = 20.0 if second else 10.0
+        seen = seen_at(stamp_ns, place_m - north_m, box_px=float(number % 3), track_id=track_id)
+        if number == 40 and between == "another behaviour":
+            check.begin_again()
+        approached = None if number == 40 and between == "none for a moment" else Approached(seen)
+        assert not check.update(approached, (seen,), stamp_ns, (north_m, 0.0, -HEIGHT_M))
+
+
+def test_beginning_again_keeps_the_fault() -> None:
+    check = ClosingCheck()
+    for number in range(60):
+        stamp_ns = 10**9 + number * PERIOD_NS
+        seen = Approached(seen_at(stamp_ns, 10.0))
+        check.update(seen, (), stamp_ns, (0.2 * number, 0.0, -HEIGHT_M))
+    check.begin_again()
+    assert check.fault
