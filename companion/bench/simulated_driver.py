@@ -128,7 +128,11 @@ class SimulatedDriver:
         copter = isinstance(vehicle.vehicle, CopterVehicle)
         self._kind = ARDUPILOT if copter else PX4
         self._profile: AutopilotProfile = ArduPilotProfile() if copter else Px4Profile()
-        self._state = VehicleState(autopilot=self._profile.name, range_finder_height=range_finder_height)
+        self._state = VehicleState(
+            autopilot=self._profile.name,
+            is_plane=False if copter else None,
+            range_finder_height=range_finder_height,
+        )
         self._changes = ModeChanges(
             lambda command, values, confirmation: self.vehicle.send(self._long(command, *values)),
             self._profile.mode_parameters,

@@ -33,7 +33,7 @@ from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.telemetry import Fields
-from companion.vehicle.vehicle_type import ARDUPILOT, AUTOPILOT_NAMES, VTOL_STATE_MISSING, why_not_flown
+from companion.vehicle.vehicle_type import ARDUPILOT, AUTOPILOT_NAMES, NOT_KNOWN_YET, why_not_flown
 
 GUIDED, BRAKE = 4, 17
 
@@ -119,7 +119,7 @@ class ArduPilotProfile(AutopilotProfile):
         custom_mode: int = fields["custom_mode"]
         if mav_type is not None and autopilot is not None:
             why = why_not_flown(mav_type, autopilot, state.vtol_state, is_plane=state.is_plane)
-            if autopilot != ARDUPILOT or why not in (None, VTOL_STATE_MISSING):
+            if autopilot != ARDUPILOT or why not in (None, *NOT_KNOWN_YET):
                 return FlightMode.UNKNOWN
         if custom_mode == GUIDED:
             self._seen_guided = True

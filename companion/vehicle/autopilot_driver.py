@@ -72,6 +72,7 @@ _REQUEST_MESSAGE = 512
 _VERSION_TIMEOUT_S = 2.0
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
+_IDENTIFY_PERIOD_S = 1.0
 _TIMESYNCS_KEPT = 8  # those of the last 4 s
 _MOST_OTHERS = 64  # senders that are logged
 
@@ -213,18 +214,30 @@ class AutopilotDriver(ABC):
         self._start_tasks()
 
     async def _identify(self) -> None:
-        """Find out whether an ArduPilot that reports a multicopter's type is a quadplane (`vehicle_type`)."""
+        """Find out whether an ArduPilot that reports a multicopter's type is a quadplane (`vehicle_type`).
+
+        Without an answer it is not known, and nothing is flown.
+        """
         if self._autopilot_kind != ARDUPILOT:
             return
         for name, is_plane in ((COPTER_PARAMETER, False), (PLANE_PARAMETER, True)):
             with contextlib.suppress(CommandRefusedError):
                 await self.get_parameter(name)
-                self._telemetry.state = replace(self._telemetry.state, is_plane=is_plane)
+                self._telemetry.use_program(is_plane=is_plane)
                 return
-        logger.warning(
-            "%s: neither %s nor %s received: by its type alone it is taken for Copter",
-            *(self.url, COPTER_PARAMETER, PLANE_PARAMETER),
-        )
+
+    async def _keep_identified(self) -> None:
+        """Ask whenever it is not known: also after a restart, a silence and a standstill."""
+
+        def due() -> bool:
+            state = self._telemetry.state
+            return state.is_plane is None and state.connected(time.monotonic_ns())
+
+        while self._autopilot_kind == ARDUPILOT:
+            await self._telemetry.until(due, None)
+            await self._identify()
+            if self._telemetry.state.is_plane is None:
+                await asyncio.sleep(_IDENTIFY_PERIOD_S)  # a refusal may come at once
 
     def _start_tasks(self) -> None:
         name = self._telemetry.profile.name
@@ -236,6 +249,7 @@ class AutopilotDriver(ABC):
             (self._supervise(self._streams), "supervisor"),
             (self._streams.run(), "streams"),
             (self._synchronise(), "clock"),
+            (self._keep_identified(), "identity"),
             (self._gimbal_commands.run(), "gimbal"),
             *([(self._reports.load_events(), "events")] if self._telemetry.profile.has_events else []),
         ):
@@ -711,8 +725,6 @@ class AutopilotDriver(ABC):
         while True:
             self._telemetry.restarted.clear()
             self.link_count += 1
-            if self.link_count > 1:
-                await self._identify()
             streams.restart()
             self._gimbal_commands.request_search()
             if not await self._wait_silent():

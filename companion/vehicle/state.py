@@ -136,7 +136,7 @@ class VehicleState:
         autopilot: "PX4" or "ArduPilot", None until its first heartbeat.
         mav_type, mav_autopilot: MAV_TYPE and MAV_AUTOPILOT of the newest heartbeat; None until the first.
         vtol_state: None until EXTENDED_SYS_STATE is received.
-        is_plane: an ArduPilot that has a parameter of Plane, whatever type it reports.
+        is_plane: whether an ArduPilot has a parameter of Plane, whatever type it reports; None: not known.
         missing_streams: names of required messages received below half of their rate.
         other_commanders: other companion services received on the link, of any age.
         own_address: system and component id of our messages.
@@ -185,7 +185,7 @@ class VehicleState:
     mav_type: int | None = None
     mav_autopilot: int | None = None
     vtol_state: VtolState | None = None
-    is_plane: bool = False
+    is_plane: bool | None = None
     missing_streams: tuple[str, ...] = ()
     other_commanders: tuple[Commander, ...] = ()
     own_address: Address = (1, 191)

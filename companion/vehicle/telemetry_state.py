@@ -96,6 +96,8 @@ class TelemetryState:
         if name in _CLOCKED:
             self.watch_clock(name, fields["time_boot_ms"], now_ns)
         elif name == "HEARTBEAT":
+            if not self.state.connected(now_ns):  # what answers after a silence may be another vehicle
+                self.state = replace(self.state, is_plane=None)
             self._watch_booting(fields["system_status"] == _BOOTING)
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self.mode_ns = now_ns
@@ -146,6 +148,10 @@ class TelemetryState:
         """From now on our messages have this address."""
         self._own_address = own_address
         self._publish(replace(self.state, own_address=own_address, address_shared_ns=0), "COMMANDER", {})
+
+    def use_program(self, *, is_plane: bool) -> None:
+        """From now on this ArduPilot is Plane, or Copter (`vehicle_type`)."""
+        self._publish(replace(self.state, is_plane=is_plane), "PROGRAM", {})
 
     def _publish(self, state: VehicleState, name: str, fields: Fields) -> None:
         """Set the state after a message, and notify watchers and subscribers."""
@@ -200,6 +206,7 @@ class TelemetryState:
             home_position_ned_m=None,
             position_valid=None,
             vtol_state=None,
+            is_plane=None,
             ground=None,
             odometry=None,
             clock=None,
@@ -219,6 +226,7 @@ class TelemetryState:
                 battery_ns=0,
                 attitude=None,
                 position_ned_m=None,
+                is_plane=None,
                 ground=None,
                 odometry=None,
                 clock=None,

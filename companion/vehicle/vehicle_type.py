@@ -12,7 +12,8 @@ in Copter and QSTABILIZE, without throttle, in Plane. So a vehicle that is not l
 ArduPilot's quadplanes are vehicles of Plane, whose modes have other numbers, in hover too. They report the
 type that the parameter Q_MAV_TYPE says, by default a fixed wing, but also a quadrotor, and in hover the
 vtol_state that Copter always has (MC; 4.7, measured). So the driver asks for a parameter that only Plane has,
-and for one that only Copter has (`PLANE_PARAMETER`, `COPTER_PARAMETER`). With ArduPilot no type is known
+and for one that only Copter has (`PLANE_PARAMETER`, `COPTER_PARAMETER`), until one is answered: ArduPilot
+answers no request for a parameter that it does not have. With ArduPilot no type is known before that, nor
 before EXTENDED_SYS_STATE.
 """
 
@@ -86,6 +87,11 @@ _VTOL_WORDS = {
 _FLOWN = "only multicopters and helicopters are flown, and PX4's VTOLs while they hover"
 # Not an answer yet: EXTENDED_SYS_STATE comes after the first heartbeat.
 VTOL_STATE_MISSING = "it is not known yet whether the vehicle hovers: EXTENDED_SYS_STATE not received"
+PROGRAM_MISSING = (
+    f"it is not known yet whether this ArduPilot is Copter: neither {COPTER_PARAMETER} nor {PLANE_PARAMETER} "
+    "received; both are requested until one is answered"
+)
+NOT_KNOWN_YET = (VTOL_STATE_MISSING, PROGRAM_MISSING)
 
 
 def type_text(mav_type: int) -> str:
@@ -100,14 +106,14 @@ def autopilot_text(autopilot: int) -> str:
 
 
 def why_not_flown(
-    mav_type: int, autopilot: int, vtol_state: VtolState | None, *, is_plane: bool = False
+    mav_type: int, autopilot: int, vtol_state: VtolState | None, *, is_plane: bool | None = None
 ) -> str | None:
     """Return why a vehicle gets no flight command, in words; None: it is flown.
 
     Args:
         mav_type, autopilot: MAV_TYPE and MAV_AUTOPILOT of its newest heartbeat.
         vtol_state: of its newest EXTENDED_SYS_STATE; None: none received.
-        is_plane: an ArduPilot that has `PLANE_PARAMETER`.
+        is_plane: of an ArduPilot, whether it has `PLANE_PARAMETER` or `COPTER_PARAMETER`; None: not known.
     """
     what = f"the vehicle is {type_text(mav_type)} of {autopilot_text(autopilot)}"
     if autopilot not in AUTOPILOT_NAMES or mav_type not in MULTICOPTERS | VTOLS:
@@ -121,7 +127,7 @@ def why_not_flown(
             return VTOL_STATE_MISSING
         if vtol_state not in (VtolState.UNDEFINED, VtolState.MC):
             return f"{what} {_VTOL_WORDS[vtol_state]}, so it is a quadplane: {_FLOWN}"
-        return None
+        return PROGRAM_MISSING if is_plane is None else None
     if vtol_state is VtolState.MC or (mav_type in MULTICOPTERS and not vtol_state):
         return None
     if vtol_state is None:

@@ -22,7 +22,7 @@ from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import VehicleState
-from companion.vehicle.vehicle_type import PX4, VtolState
+from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VtolState
 
 
 class FakeDriver:
@@ -232,6 +232,18 @@ def test_vehicle_that_is_not_flown_is_reported_once_per_change() -> None:
     assert step(tiltrotor, VtolState.FW) == ["error"]
     assert step(tiltrotor, VtolState.MC) == ["info"]
     assert step(fixed_wing, VtolState.UNDEFINED) == ["error"]
+
+
+def test_ardupilot_that_does_not_say_what_it_is_is_reported() -> None:
+    health, driver, _, events = health_of("ArduPilot", {}, None)
+    unknown = VehicleState(autopilot="ArduPilot", mav_type=2, mav_autopilot=ARDUPILOT)
+    for vtol_state, level in ((None, []), (VtolState.MC, ["error"])):
+        driver.state = replace(unknown, vtol_state=vtol_state)
+        health.after_step(0, guidance())
+        assert [level for level, _ in events] == level
+    driver.state = replace(driver.state, is_plane=False)
+    health.after_step(0, guidance())
+    assert [level for level, _ in events] == ["error", "info"]
 
 
 async def test_answers_of_an_earlier_link_are_not_used() -> None:

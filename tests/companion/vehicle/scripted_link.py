@@ -71,6 +71,11 @@ class ScriptedDriver:
         fields = {"vtol_state": vtol_state, "landed_state": landed_state}
         self.driver._telemetry.handle("EXTENDED_SYS_STATE", fields)
 
+    def program(self, *, is_plane: bool | None = False) -> None:
+        """The answer of an ArduPilot to a request for its parameters; None: neither was received."""
+        if is_plane is not None:
+            self.driver._telemetry.use_program(is_plane=is_plane)
+
     def taken(self) -> list[Frame]:
         """Return and forget what was sent."""
         frames = [frame for data in self.link.sent for frame in frames_of(data)]

@@ -17,7 +17,7 @@ from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from companion.vehicle.vehicle_type import VtolState
+from companion.vehicle.vehicle_type import PROGRAM_MISSING, VtolState
 from mavlink_sim.testing import RunningSimulator, free_port, vehicle
 from tests.companion.vehicle.fake_autopilot import SETPOINT, FakeAutopilot, wait_for_state, wait_until
 
@@ -199,11 +199,65 @@ async def test_quadplane_that_reports_a_quadrotor_is_not_flown() -> None:
         await driver.connect(10.0)
         autopilot.landed(mavlink.MAV_LANDED_STATE_IN_AIR)
         await wait_for_state(driver, lambda state: state.vtol_state is VtolState.MC)
-        assert driver.state.is_plane
+        assert driver.state.is_plane is True
         assert driver.state.not_flown is not None
         with pytest.raises(CommandRefusedError):
             await driver.set_mode(FlightMode.HOLD)  # 17: QSTABILIZE
         assert not [m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
+    finally:
+        await driver.close()
+        await autopilot.stop()
+
+
+@pytest.mark.realtime
+async def test_no_command_until_copter_or_plane_has_answered() -> None:
+    """A link that loses the answers; then one in service, then a standstill."""
+    port = free_port()
+    autopilot = FakeAutopilot(port, autopilot=3)
+    autopilot.vtol_state, parameters = mavlink.MAV_VTOL_STATE_MC, autopilot.parameters
+    autopilot.parameters = {}
+    autopilot.start()
+    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}")
+    try:
+        await driver.connect(10.0)
+        autopilot.landed(mavlink.MAV_LANDED_STATE_IN_AIR)
+        await wait_for_state(driver, lambda state: state.vtol_state is VtolState.MC)
+        assert driver.state.not_flown == PROGRAM_MISSING
+        with pytest.raises(CommandRefusedError, match="FRAME_CLASS"):
+            await driver.set_mode(FlightMode.HOLD)
+        assert not [m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
+        told: list[bool | None] = []
+        driver.subscribe(lambda state: told.append(state.is_plane))
+        autopilot.parameters = parameters
+        await wait_for_state(driver, lambda state: state.not_flown is None)
+        assert told[-1] is False
+        driver.discard_received()
+        assert driver.state.is_plane is None
+        await wait_for_state(driver, lambda state: state.is_plane is False)
+    finally:
+        await driver.close()
+        await autopilot.stop()
+
+
+@pytest.mark.realtime
+async def test_streams_are_requested_again_before_the_identity(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a restart, where the answers to parameter requests are lost."""
+    port = free_port()
+    autopilot = FakeAutopilot(port, autopilot=3)
+    autopilot.start()
+    driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}")
+    try:
+        await driver.connect(10.0)
+        await wait_until(lambda: driver.link_count == 1 and driver.state.is_plane is False, 5.0)
+        assert isinstance(driver, AutopilotDriver)
+        requested = asyncio.Event()
+        monkeypatch.setattr(driver._streams, "restart", requested.set)
+        autopilot.parameters = {}
+        autopilot.send(mavlink.MAVLink_system_time_message(0, 60_000))
+        autopilot.send(mavlink.MAVLink_system_time_message(0, 100))
+        await wait_for_state(driver, lambda state: state.is_plane is None)
+        await asyncio.wait_for(requested.wait(), 2.0)
+        assert driver.state.is_plane is None
     finally:
         await driver.close()
         await autopilot.stop()

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import itertools
 import time
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -21,6 +24,7 @@ from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.vehicle_type import (
     MULTICOPTERS,
+    PROGRAM_MISSING,
     VTOL_STATE_MISSING,
     VTOLS,
     VtolState,
@@ -46,6 +50,7 @@ COPTERS = {
 HOVERING_TYPES = set(range(mavlink.MAV_TYPE_VTOL_DUOROTOR, mavlink.MAV_TYPE_VTOL_RESERVED5 + 1))
 UNDEFINED, MC, FW = VtolState.UNDEFINED, VtolState.MC, VtolState.FW
 VTOL_STATES = (None, *VtolState)
+PROGRAMS = (None, False, True)  # is_plane
 # What moves a vehicle, arms it or changes how it flies.
 FORBIDDEN_MESSAGES = {
     mavlink.MAVLINK_MSG_ID_SET_MODE,
@@ -88,10 +93,10 @@ COMMANDS = (
 )
 
 
-def flown(mav_type: int, autopilot: int, vtol_state: VtolState | None) -> bool:
+def flown(mav_type: int, autopilot: int, vtol_state: VtolState | None, is_plane: bool | None = False) -> bool:
     """The promise, in other words than the table's."""
     if autopilot == ARDUPILOT:
-        return mav_type in COPTERS and vtol_state in (UNDEFINED, MC)
+        return is_plane is False and mav_type in COPTERS and vtol_state in (UNDEFINED, MC)
     hovers = vtol_state in ((None, UNDEFINED, MC) if mav_type in COPTERS else (MC,))
     return autopilot == PX4 and mav_type in COPTERS | HOVERING_TYPES and hovers
 
@@ -112,21 +117,23 @@ def test_table_has_the_types_of_mavlink() -> None:
 @pytest.mark.parametrize("autopilot", range(21))
 def test_table_of_types_autopilots_and_vtol_states(autopilot: int) -> None:
     for mav_type in range(256):
-        for vtol_state in VTOL_STATES:
-            why = why_not_flown(mav_type, autopilot, vtol_state)
-            assert (why is None) is flown(mav_type, autopilot, vtol_state), (mav_type, vtol_state)
+        for vtol_state, is_plane in itertools.product(VTOL_STATES, PROGRAMS):
+            why = why_not_flown(mav_type, autopilot, vtol_state, is_plane=is_plane)
+            expected = flown(mav_type, autopilot, vtol_state, is_plane)
+            assert (why is None) is expected, (mav_type, vtol_state, is_plane)
 
 
 @pytest.mark.parametrize("vtol_state", VTOL_STATES)
 @pytest.mark.parametrize("mav_type", [FIXED_WING, *sorted(HOVERING_TYPES)])
 def test_quadplane_of_ardupilot_is_never_flown(mav_type: int, vtol_state: VtolState | None) -> None:
-    assert why_not_flown(mav_type, ARDUPILOT, vtol_state) is not None
+    for is_plane in PROGRAMS:
+        assert why_not_flown(mav_type, ARDUPILOT, vtol_state, is_plane=is_plane) is not None
 
 
 def test_quadplane_that_claims_to_be_a_quadrotor_is_never_flown() -> None:
-    assert why_not_flown(QUADROTOR, ARDUPILOT, None) == VTOL_STATE_MISSING
+    assert why_not_flown(QUADROTOR, ARDUPILOT, None, is_plane=False) == VTOL_STATE_MISSING
+    assert why_not_flown(QUADROTOR, ARDUPILOT, MC) == PROGRAM_MISSING
     for vtol_state in VtolState:
-        assert (why_not_flown(QUADROTOR, ARDUPILOT, vtol_state) is None) is (vtol_state in (UNDEFINED, MC))
         assert why_not_flown(QUADROTOR, ARDUPILOT, vtol_state, is_plane=True) is not None
 
 
@@ -197,16 +204,16 @@ def fresh(scripted: ScriptedDriver) -> bytes:
 def test_driver_sends_no_motion_to_an_unlisted_type(kind: DriverKind, autopilot: int) -> None:
     scripted = ScriptedDriver(kind)
     for mav_type in range(49):
-        for vtol_state in VTOL_STATES:
+        for vtol_state, is_plane in itertools.product(VTOL_STATES, PROGRAMS):
             scripted.heartbeat(mav_type, autopilot)
-            if vtol_state is None:
-                scripted.driver._telemetry._invalidate()  # the autopilot has restarted
-            else:
+            scripted.driver._telemetry._invalidate()  # the autopilot has restarted
+            if vtol_state is not None:
                 scripted.vtol_state(vtol_state)
+            scripted.program(is_plane=is_plane)
             every_message(scripted)
             frames = scripted.taken()
-            expected = flown(mav_type, autopilot, vtol_state)
-            assert any(moves(frame) for frame in frames) is expected, (mav_type, vtol_state)
+            expected = flown(mav_type, autopilot, vtol_state, is_plane)
+            assert any(moves(frame) for frame in frames) is expected, (mav_type, vtol_state, is_plane)
             assert {frame.message_id for frame in frames} >= {mavlink.MAVLINK_MSG_ID_COMMAND_LONG}
 
 
@@ -233,6 +240,7 @@ def test_another_autopilot_on_the_link_is_not_flown(kind: DriverKind, first: int
     for autopilot, expected in ((first, True), (second, False), (first, True)):
         scripted.heartbeat(autopilot=autopilot)
         scripted.vtol_state(UNDEFINED)
+        scripted.program()
         every_message(scripted)
         assert any(moves(frame) for frame in scripted.taken()) is expected
 
@@ -260,6 +268,8 @@ STEPS = st.one_of(
         st.sampled_from([PX4, PX4, ARDUPILOT, 0, mavlink.MAV_AUTOPILOT_INVALID]),
     ),
     st.tuples(st.just("vtol_state"), st.sampled_from(VtolState), st.just(0)),
+    st.tuples(st.just("program"), st.booleans(), st.just(0)),
+    st.tuples(st.just("forget"), st.sampled_from(["restart", "silence", "standstill"]), st.just(0)),
     st.tuples(st.just("request"), st.integers(0, 7), st.just(0)),
 )
 
@@ -267,14 +277,14 @@ STEPS = st.one_of(
 @pytest.mark.parametrize("first", [PX4, ARDUPILOT])
 @given(steps=st.lists(STEPS, max_size=12))
 def test_nothing_moves_while_the_newest_type_is_unlisted(
-    first: int, steps: list[tuple[str, int, int]]
+    first: int, steps: list[tuple[str, Any, int]]
 ) -> None:
     asyncio.run(play(first, steps))
 
 
-async def play(first: int, steps: list[tuple[str, int, int]]) -> None:
+async def play(first: int, steps: list[tuple[str, Any, int]]) -> None:
     scripted = ScriptedDriver("pymavlink")
-    driver, newest, vtol_state = scripted.driver, (QUADROTOR, first), None
+    driver, newest, vtol_state, is_plane = scripted.driver, (QUADROTOR, first), None, None
     scripted.heartbeat(*newest)
     driver._telemetry.handle("HOME_POSITION", {"altitude": 0, "latitude": 0, "longitude": 0, **NOWHERE})
     requests = (
@@ -293,13 +303,21 @@ async def play(first: int, steps: list[tuple[str, int, int]]) -> None:
         elif step == "vtol_state":
             vtol_state = VtolState(value)
             scripted.vtol_state(value)
+        elif step == "program":
+            is_plane = bool(value)
+            scripted.program(is_plane=is_plane)
+        elif step == "forget":
+            is_plane = None
+            vtol_state = None if value == "restart" else vtol_state
+            FORGET[value](scripted)
+            scripted.heartbeat(*newest)
         elif value < len(requests):
             tasks.append(asyncio.create_task(suppressed(requests[value])))
         else:
             OWN_MESSAGES[value - len(requests)](scripted)
         for _ in range(4):
             await asyncio.sleep(0)
-        may_move = newest[1] == first and flown(*newest, vtol_state)
+        may_move = newest[1] == first and flown(*newest, vtol_state, is_plane)
         assert may_move or not any(map(moves, scripted.taken()))
         scripted.taken()
     for task in tasks:
@@ -307,6 +325,16 @@ async def play(first: int, steps: list[tuple[str, int, int]]) -> None:
     await asyncio.gather(*tasks, return_exceptions=True)
 
 
+def silence(scripted: ScriptedDriver) -> None:
+    telemetry = scripted.driver._telemetry
+    telemetry.state = replace(telemetry.state, heartbeat_ns=time.monotonic_ns() - 4_000_000_000)
+
+
+FORGET: dict[str, Callable[[ScriptedDriver], None]] = {
+    "restart": lambda scripted: scripted.driver._telemetry._invalidate(),
+    "silence": silence,
+    "standstill": lambda scripted: scripted.driver.discard_received(),
+}
 NOWHERE = {"x": 0.0, "y": 0.0, "z": 0.0}
 
 
