@@ -58,6 +58,7 @@ _HEARTBEAT = struct.Struct(
     "<IBBBBB"
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
+EXTENDED_SYS_STATE_ID = 245
 _COMMAND_ACK_ID = 77
 _COMMAND_ACK = struct.Struct("<HBBiBB")  # command, result, progress, result_param2, target system, component
 _NAMED_VALUE_INT_ID = 252
@@ -368,6 +369,9 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == CURRENT_MODE_ID:
                         self._current_mode_from(frame)
                         continue
+                    elif frame.message_id == EXTENDED_SYS_STATE_ID:
+                        self._extended_sys_state_from(frame)
+                        continue
                     elif frame.message_id == _COMMAND_ACK_ID:
                         self._acknowledgement_from(frame)
                     elif self._reports.on_frame(frame):
@@ -438,6 +442,13 @@ class AutopilotDriver(ABC):
             shown, intended = _CURRENT_MODE.unpack(frame.padded(_CURRENT_MODE.size))
             fields = {"custom_mode": shown, "intended_custom_mode": intended}
             self._telemetry.handle("CURRENT_MODE", fields)
+
+    def _extended_sys_state_from(self, frame: Frame) -> None:
+        """Apply an EXTENDED_SYS_STATE here: a library may deliver it after what ended its validity."""
+        if self._autopilot_kind in self.supported_autopilots:
+            vtol_state, landed_state = frame.padded(2)
+            fields = {"vtol_state": vtol_state, "landed_state": landed_state}
+            self._telemetry.handle("EXTENDED_SYS_STATE", fields)
 
     def _acknowledgement_from(self, frame: Frame) -> None:
         """Apply a COMMAND_ACK here: its order among the reports of the mode counts (`mode_changes`).

@@ -39,8 +39,8 @@ logger = logging.getLogger(__name__)
 _library_logger = logging.getLogger("mavsdk")
 
 _T = TypeVar("_T")
-# The base class applies both modes and the acknowledgements in their order of arrival.
-_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT", "CURRENT_MODE"})
+# The base class applies modes, VTOL states and acknowledgements in their order of arrival.
+_SUBSCRIBED = sorted(TELEMETRY_MESSAGES - {"HEARTBEAT", "CURRENT_MODE", "EXTENDED_SYS_STATE"})
 # After a hang of the loop: neither a setpoint nor a repeated command may arrive late.
 _STALE_NS = round(DEFAULT_LIFETIME_S * 1e9)
 _PARAM_REASONS = {

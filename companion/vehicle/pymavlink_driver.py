@@ -11,7 +11,12 @@ from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
+from companion.vehicle.autopilot_driver import (
+    AUTOPILOT_COMPONENT,
+    EXTENDED_SYS_STATE_ID,
+    HEARTBEAT_ID,
+    AutopilotDriver,
+)
 from companion.vehicle.driver import CommandRefusedError, OnBytes
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
@@ -30,7 +35,7 @@ _DECODED_IDS = {
     message_id
     for message_id, message in mavlink.mavlink_map.items()
     if message.msgname in TELEMETRY_MESSAGES | {"PARAM_VALUE", "PARAM_ERROR", "GPS_GLOBAL_ORIGIN"}
-} - {HEARTBEAT_ID}
+} - {HEARTBEAT_ID, EXTENDED_SYS_STATE_ID}
 
 # Command protocol: 5 attempts half a second apart; after IN_PROGRESS it only waits.
 _ATTEMPTS = 5

@@ -97,7 +97,7 @@ class TelemetryState:
             self.watch_clock(name, fields["time_boot_ms"], now_ns)
         elif name == "HEARTBEAT":
             if not self.state.connected(now_ns):  # what answers after a silence may be another vehicle
-                self.state = replace(self.state, is_plane=None)
+                self.state = replace(self.state, vtol_state=None, is_plane=None)
             self._watch_booting(fields["system_status"] == _BOOTING)
         if name in ("HEARTBEAT", "CURRENT_MODE"):
             self.mode_ns = now_ns
@@ -226,6 +226,7 @@ class TelemetryState:
                 battery_ns=0,
                 attitude=None,
                 position_ned_m=None,
+                vtol_state=None,
                 is_plane=None,
                 ground=None,
                 odometry=None,

@@ -67,9 +67,8 @@ class ScriptedDriver:
         self.receive(mavlink.MAVLink_heartbeat_message(mav_type, autopilot, 0x81, mode, 4, 3), source=source)
 
     def vtol_state(self, vtol_state: int, landed_state: int = 2) -> None:
-        """An EXTENDED_SYS_STATE. MAVSDK's decoding, in threads, is left out."""
-        fields = {"vtol_state": vtol_state, "landed_state": landed_state}
-        self.driver._telemetry.handle("EXTENDED_SYS_STATE", fields)
+        """An EXTENDED_SYS_STATE."""
+        self.receive(mavlink.MAVLink_extended_sys_state_message(vtol_state, landed_state))
 
     def program(self, *, is_plane: bool | None = False) -> None:
         """The answer of an ArduPilot to a request for its parameters; None: neither was received."""
