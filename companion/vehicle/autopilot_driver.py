@@ -28,10 +28,10 @@ from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, frames_of, is_signed, pack_frame
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim, address_text
 from companion.vehicle.gimbal_commands import GimbalCommands
-from companion.vehicle.harmless import is_harmless
+from companion.vehicle.harmless import are_harmless
 from companion.vehicle.landing_target import LandingTarget, landing_target_fields
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.mav_result import result_name
@@ -556,7 +556,7 @@ class AutopilotDriver(ABC):
         """
         standstill = self.watch.observe().standstill
         why = self._telemetry.state.not_flown or (None if standstill is None else standstill.why)
-        if why is None or all(map(is_harmless, frames_of(frame))):
+        if why is None or are_harmless(frame):
             return False
         if why != self._withheld:
             logger.warning("%s: nothing is sent that moves the vehicle: %s", self.url, why)

@@ -7,7 +7,7 @@ LANDING_TARGET steers its landing, PARAM_SET changes how it flies.
 
 from __future__ import annotations
 
-from companion.vehicle.framing import REQUEST_EVENT_ID, Frame
+from companion.vehicle.framing import REQUEST_EVENT_ID, Frame, frames_of
 
 # MAVLink common.
 _COMMAND_INT_ID, _COMMAND_LONG_ID = 75, 76
@@ -35,8 +35,14 @@ COMMANDS = frozenset(
 _COMMAND_AT, _COMMAND_END = 28, 30  # of both command messages
 
 
-def is_harmless(frame: Frame) -> bool:
-    """Whether a frame of ours may go to any vehicle."""
+def are_harmless(data: bytes) -> bool:
+    """Whether bytes of ours are harmless frames and nothing else."""
+    frames = list(frames_of(data))
+    # What is no frame here may be one to the autopilot, whose definitions may be others.
+    return sum(len(frame.raw) for frame in frames) == len(data) and all(map(_is_harmless, frames))
+
+
+def _is_harmless(frame: Frame) -> bool:
     if frame.message_id in (_COMMAND_LONG_ID, _COMMAND_INT_ID):
         command = frame.padded(_COMMAND_END)[_COMMAND_AT:_COMMAND_END]
         return int.from_bytes(command, "little") in COMMANDS

@@ -234,6 +234,27 @@ def test_driver_sends_no_motion_to_an_unlisted_type(kind: DriverKind, autopilot:
             assert {frame.message_id for frame in frames} >= {mavlink.MAVLINK_MSG_ID_COMMAND_LONG}
 
 
+HARMLESS, MODE = PACKED[COMMANDS.index(mavlink.MAV_CMD_REQUEST_MESSAGE)], PACKED[-8]
+WRONG_CHECKSUM = bytes((*MODE[:-1], MODE[-1] ^ 1))
+NO_HARMLESS = {
+    "wrong checksum": WRONG_CHECKSUM,
+    "cut": MODE[:-1],
+    "no frame": b"mode",
+    "second frame": HARMLESS + MODE,
+    "second with a wrong checksum": HARMLESS + WRONG_CHECKSUM,
+}
+
+
+@pytest.mark.parametrize("data", NO_HARMLESS.values(), ids=NO_HARMLESS)
+def test_what_is_no_harmless_frame_is_withheld(kind: DriverKind, data: bytes) -> None:
+    scripted = ScriptedDriver(kind)
+    scripted.heartbeat(FIXED_WING)
+    scripted.driver._transmit(data)
+    assert scripted.link.sent == []
+    scripted.driver._transmit(HARMLESS + HARMLESS)
+    assert scripted.link.sent == [HARMLESS + HARMLESS]
+
+
 @pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
 async def test_driver_refuses_commands_with_the_reason(kind: DriverKind, autopilot: int) -> None:
     scripted = ScriptedDriver(kind)
