@@ -59,6 +59,8 @@ _HEARTBEAT = struct.Struct(
 )  # custom_mode, type, autopilot, base_mode, system_status, mavlink_version
 _CURRENT_MODE = struct.Struct("<II")  # custom_mode, intended_custom_mode; standard_mode is not read
 EXTENDED_SYS_STATE_ID = 245
+_COMMAND_LONG_ID = 76
+_COMMAND_LONG = struct.Struct("<7fHBBB")  # parameters, command, target system, component, confirmation
 _COMMAND_ACK_ID = 77
 _COMMAND_ACK = struct.Struct("<HBBiBB")  # command, result, progress, result_param2, target system, component
 _NAMED_VALUE_INT_ID = 252
@@ -168,10 +170,6 @@ class AutopilotDriver(ABC):
     @abstractmethod
     def _send_message(self, name: str, fields: dict[str, Any]) -> None:
         """Send one message."""
-
-    @abstractmethod
-    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        """Send one COMMAND_LONG, once. `parameters`: all seven."""
 
     @abstractmethod
     async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
@@ -647,6 +645,15 @@ class AutopilotDriver(ABC):
                 return await self._exchange_command(command, (*parameters, *[0.0] * (7 - len(parameters))))
             finally:
                 self._address.asked(command, time.monotonic_ns())
+
+    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
+        """Send one COMMAND_LONG, once and at once. `parameters`: all seven.
+
+        Not by a library: `mode_changes` relies on the order of commands and TIMESYNC requests on the link.
+        """
+        target = (self._system_id or 0, AUTOPILOT_COMPONENT)
+        payload = _COMMAND_LONG.pack(*parameters, command, *target, confirmation)
+        self._transmit_payload(_COMMAND_LONG_ID, payload)
 
     def _send_once(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         """Send a command that changes the mode: only `mode_changes` repeats it."""

@@ -167,24 +167,15 @@ class MavsdkDriver(AutopilotDriver):
 
     # --- commands and parameters --------------------------------------------------------------------
 
-    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        self._send_message("COMMAND_LONG", self._command_fields(command, parameters, confirmation))
-
-    def _command_fields(
-        self, command: int, parameters: tuple[float, ...], confirmation: int
-    ) -> dict[str, Any]:
+    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
         fields: dict[str, Any] = {
             "target_system": self._system_id,
             "target_component": AUTOPILOT_COMPONENT,
             "command": command,
-            "confirmation": confirmation,
+            "confirmation": 0,
         }
         for number, value in enumerate(parameters, start=1):
             fields[f"param{number}"] = None if value != value else float(value)  # JSON has no NaN
-        return fields
-
-    async def _exchange_command(self, command: int, parameters: tuple[float, ...]) -> int:
-        fields = self._command_fields(command, parameters, 0)
         if self._direct is None:
             raise CommandRefusedError(f"{self.url}: not connected; command {command} was not sent")
         answered: asyncio.Future[tuple[MavlinkDirectResult, MavlinkMessage]] = self._loop.create_future()

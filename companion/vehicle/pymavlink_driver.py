@@ -152,16 +152,6 @@ class PymavlinkDriver(AutopilotDriver):
             f"no answer to command {command} ({_ATTEMPTS} attempts, {_ATTEMPT_S:g} s apart)"
         )
 
-    def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
-        fields = {
-            "target_system": self._system_id or 0,
-            "target_component": AUTOPILOT_COMPONENT,
-            "command": command,
-            "confirmation": confirmation,
-        }
-        values = {f"param{number}": value for number, value in enumerate(parameters, start=1)}
-        self._send_message("COMMAND_LONG", fields | values)
-
     # --- parameters ---------------------------------------------------------------------------------
 
     async def get_parameter(self, name: str) -> float:

@@ -13,7 +13,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.driver import Driver, SystemStatus
-from companion.vehicle.drivers import open_driver
+from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import CURRENT_MODE_ID, pack_frame
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -27,6 +27,7 @@ from tests.companion.vehicle.fake_autopilot import (
     wait_for_state,
     wait_until,
 )
+from tests.companion.vehicle.scripted_link import ScriptedDriver
 
 pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
 
@@ -307,3 +308,24 @@ async def test_noise_between_messages_loses_none(driver: Driver, autopilot: Fake
     autopilot.send_bytes(b"")
     autopilot.send(mavlink.MAVLink_local_position_ned_message(5, 1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
     await wait_for_state(driver, lambda s: s.position_ned_m == (1.0, 2.0, 3.0))
+
+
+def test_mode_command_is_on_the_link_at_once_and_in_order(kind: DriverKind) -> None:
+    """So an answered TIMESYNC request that was sent after it shows that it has arrived or is lost."""
+    scripted = ScriptedDriver(kind)
+    scripted.heartbeat()
+    for confirmation in (0, 1):
+        scripted.driver._send_once(mavlink.MAV_CMD_NAV_TAKEOFF, (math.nan, 2.5), confirmation)
+        scripted.driver._transmit_payload(mavlink.MAVLINK_MSG_ID_TIMESYNC, bytes(18))
+    frames = scripted.taken()
+    assert [frame.message_id for frame in frames] == 2 * [
+        mavlink.MAVLINK_MSG_ID_COMMAND_LONG,
+        mavlink.MAVLINK_MSG_ID_TIMESYNC,
+    ]
+    commands = [mavlink.MAVLink(None).decode(bytearray(frame.raw)) for frame in frames[::2]]
+    for confirmation, command in enumerate(commands):
+        assert (command.get_srcSystem(), command.get_srcComponent()) == scripted.driver.own_address
+        assert (command.target_system, command.target_component) == (1, 1)
+        assert (command.command, command.confirmation) == (mavlink.MAV_CMD_NAV_TAKEOFF, confirmation)
+        assert math.isnan(command.param1)
+        assert (command.param2, command.param3, command.param7) == (2.5, 0.0, 0.0)
