@@ -318,6 +318,8 @@ class AutopilotDriver(ABC):
         gimbal = self._telemetry.state.gimbal
         if gimbal is not None and gimbal.primary_control == self._address.address:
             return False
+        if self._flight_commands.in_transit:
+            return False
         if not self._can_change_address or not self._address.change(time.monotonic_ns(), at_random=True):
             return False
         self._telemetry.use_address(self._address.address)

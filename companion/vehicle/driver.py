@@ -160,7 +160,8 @@ class Driver(Protocol):
     def change_address(self) -> bool:
         """Send with another component id from now on, since another program has ours.
 
-        False: none is free, the gimbal is under our control, or the library does not allow it.
+        False: none is free, the gimbal is under our control, an acknowledgement to the present address may
+        still arrive, or the library does not allow it.
         """
 
     async def find_gimbal(self) -> bool:

@@ -95,6 +95,11 @@ class FlightCommands:
             task.cancel()
         await asyncio.gather(*self._restoring, return_exceptions=True)
 
+    @property
+    def in_transit(self) -> bool:
+        """Whether a change is pending, or an acknowledgement to our address may still arrive."""
+        return self._changes.in_transit(self._clock_ns())
+
     async def settled(self) -> None:
         """Wait until no message of ours can arrive after another's change of the mode."""
         telemetry = self._telemetry

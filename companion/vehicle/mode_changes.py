@@ -125,11 +125,17 @@ class ModeChanges:
         self._newest: ModeChange | None = None
         self._reported: VehicleState | None = None
         self._dropped: list[tuple[int, float]] = []  # (custom_mode, until): it may still show
+        self._sent_ns: int | None = None  # the last message of any change
 
     @property
     def pending(self) -> bool:
         """Whether a change has not ended."""
         return self._newest is not None and self._newest.ending is None
+
+    def in_transit(self, now_ns: int) -> bool:
+        """Whether a change is pending, or an acknowledgement may still arrive."""
+        sent_ns = self._sent_ns
+        return self.pending or (sent_ns is not None and now_ns - sent_ns <= IN_FLIGHT_S * 1e9)
 
     def begin(self, change: ModeChange, state: VehicleState, now_ns: int) -> None:
         """Begin a change. `state`: the newest; where it differs from `change.before`, nothing is sent."""
@@ -270,7 +276,8 @@ class ModeChanges:
             if not change.attempts:
                 self._end(change, Ending.DROPPED, f"{change.what} not sent: the request has expired")
             return
-        change.sent_ns, change.lost = now_ns, False
+        change.sent_ns = self._sent_ns = now_ns
+        change.lost = False
         change.attempts += 1
         self._send(change.command, change.parameters, change.attempts - 1)
 

@@ -6,6 +6,7 @@ import asyncio
 import struct
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -17,13 +18,16 @@ from companion.vehicle.driver import Driver, SystemStatus
 from companion.vehicle.drivers import DriverKind, open_driver
 from companion.vehicle.framing import Frame, frames_of, pack_frame
 from companion.vehicle.own_address import OwnAddress
+from companion.vehicle.state import FlightMode
 from tests.companion.vehicle.fake_autopilot import FakeAutopilot, sender_of, wait_for_state
 from tests.companion.vehicle.scripted_link import AUTOPILOT, ScriptedDriver
 from tests.companion.vehicle.test_commander import heartbeat, named_value
+from tests.companion.vehicle.test_driver_standstill import Suspend
 
 S = 1_000_000_000
 OTHERS = (192, 193, 194)
 OTHER_SENDER = ("127.0.0.1", 4711)
+LAND = 0x06040000  # PX4's custom_mode
 MARK = commander_mode(100.0, True)
 
 
@@ -178,6 +182,32 @@ def test_changed_address_is_that_of_every_message() -> None:
 
 
 COMMAND_FIELDS = mavlink.MAVLink_command_long_message.fieldnames
+
+
+@pytest.mark.parametrize("ending", ["done", "refused", "abandoned", "replaced"])
+async def test_address_stays_until_no_acknowledgement_can_arrive(ending: str) -> None:
+    one = scripted()
+    suspend = Suspend(one.driver)
+    assert one.driver._flight_commands.in_transit is False
+    tasks = [asyncio.create_task(one.driver.set_mode(FlightMode.LAND))]
+    await asyncio.sleep(0)
+    assert not one.driver.change_address()
+    match ending:
+        case "done":
+            one.receive(acknowledgement(mavlink.MAV_CMD_DO_SET_MODE, (1, 191)))
+            one.heartbeat(mode=LAND)
+        case "refused":
+            one.receive(mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_DO_SET_MODE, 2, 0, 0, 1, 191))
+        case "abandoned":
+            one.driver.abandon("by a test")
+        case "replaced":  # by one that is not sent: decided on another state
+            old = replace(one.driver.state, custom_mode=1)
+            tasks.append(asyncio.create_task(one.driver.set_mode(FlightMode.HOLD, since=old)))
+    await asyncio.wait(tasks, timeout=1.0)
+    assert not one.driver.change_address()
+    suspend.seconds = 3.1
+    assert one.driver.change_address()
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 def test_shared_ids_are_not_used_again() -> None:
