@@ -147,9 +147,9 @@ class BehaviourRunner:
                 self._conclude(Outcome(False, why), context, sent_count)
             except Exception:
                 logger.exception("the hold after %s failed", name)
-                self._lose(why)
+                self._lose(why, context.state)
         else:
-            self._lose(why)
+            self._lose(why, context.state)
 
     def clear_failure(self) -> None:
         """This step raised nothing."""
@@ -236,7 +236,10 @@ class BehaviourRunner:
             )
 
     def _conclude(self, outcome: Outcome, context: BehaviourContext, sent_count: int) -> None:
-        """The behaviour ended by itself: hold if setpoints are active, else hand over to the autopilot."""
+        """The behaviour ended by itself: hold if setpoints are active, else hand over to the autopilot.
+
+        A vehicle that we have armed and that is still on the ground is not held there, but disarmed.
+        """
         behaviour = self.behaviour
         if behaviour is not None and self.busy and self._command is None and not self._after_battery:
             # An endless command was answered when it began: nobody waits for how it ends.
@@ -249,7 +252,7 @@ class BehaviourRunner:
         handed_over = requested is not None and context.state.mode is requested.mode
         if self._modes.phase is Phase.REQUESTING:
             self._modes.drop_request()
-        if not self._setpoints.streaming or handed_over:
+        if not self._setpoints.streaming or handed_over or self._modes.armed_on_ground:
             self._modes.release(context.state)
             return
         hold = HoldBehaviour()
@@ -286,7 +289,8 @@ class BehaviourRunner:
             logger.warning("position or attitude lost (%s): braking", fault)
             self._position_lost_ns = context.now_ns
         if context.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
-            self._lose(f"position or attitude lost for {POSITION_LOSS_S:g} s ({fault})")
+            why = f"position or attitude lost for {POSITION_LOSS_S:g} s ({fault})"
+            self._lose(why, context.state)
         elif self._modes.phase is Phase.OFFBOARD:
             self._setpoints.brake(context)
         return False
@@ -336,19 +340,20 @@ class BehaviourRunner:
             self._modes.resume(context.state.mode)
             return
         self.end(Outcome(False, why))
-        if self._modes.phase is Phase.REQUESTING and self._setpoints.streaming:
+        streaming = self._setpoints.streaming and not self._modes.armed_on_ground
+        if self._modes.phase is Phase.REQUESTING and streaming:
             self._modes.resume(context.state.mode)
             self._begin(HoldBehaviour(), None, busy=False)
         else:
             self._modes.release(context.state)
 
-    def _lose(self, why: str) -> None:
-        """Command was lost: stop streaming and end the behaviour."""
+    def _lose(self, why: str, ended_in: VehicleState | None = None) -> None:
+        """Command was lost: stop streaming and end the behaviour. `ended_in`: see `ModeControl.release`."""
         self._setpoints.stop()
         self.goal_ned_m = None
         behaviour, outcome = self.behaviour, Outcome(False, why)
         self.end(outcome, reported=True)
-        self._modes.release()
+        self._modes.release(ended_in)
         if behaviour is not None:
             message = f"command lost: {why}"
             self._out.event(EventKind.LOST, behaviour.name, message, outcome, warning=True)

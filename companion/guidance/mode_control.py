@@ -56,13 +56,18 @@ class ModeControl:
         self._engaging_since_ns = 0
         self._sent_before_engaging = 0
         self._yielded: tuple[int, str] | None = None
-        self._armed_on_ground = False  # by us, and it has not taken off since
+        self._armed_on_ground = False
         self._disarm: int | None = None
 
     @property
     def yielded(self) -> str | None:
         """Why command was lost, while the autopilot's own reason is awaited; None: it was not."""
         return None if self._yielded is None else self._yielded[1]
+
+    @property
+    def armed_on_ground(self) -> bool:
+        """Whether we have armed the vehicle, and it has not taken off since."""
+        return self._armed_on_ground
 
     def prepare(self, state: VehicleState) -> None:
         """A command begins: take command of the vehicle, or drop the autopilot mode of the one before."""

@@ -9,7 +9,7 @@ import pytest
 
 from companion.guidance.behaviour import OF_THE_MOMENT, Outcome, Requirement
 from companion.guidance.behaviours.stop import StopBehaviour
-from companion.guidance.behaviours.takeoff import BASE_TIMEOUT_S, TakeoffBehaviour
+from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
@@ -21,6 +21,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.missions.mission_file import MissionError, plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.mode_control import Phase
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.targets.ranging import RangeMeans
 from companion.vehicle.state import FlightMode, LandedState
@@ -288,17 +289,60 @@ def test_refused_takeoff_of_a_mission_disarms(on_failure: str) -> None:
     assert not harness.vehicle.armed
 
 
-def test_takeoff_that_never_lifts_disarms() -> None:
-    harness = GuidanceHarness(parked())
+LOW_M = 1.5  # flown by setpoints from the ground
+
+
+def on_ground() -> GuidanceHarness:
+    """A PX4 that reports to be on the ground for ever."""
+
+    def grounded(inputs: GuidanceInput) -> GuidanceInput:
+        return replace(inputs, state=replace(inputs.state, landed=LandedState.ON_GROUND, autopilot="PX4"))
+
+    harness = GuidanceHarness(parked(), inputs=grounded)
     harness.run(0.1)
-    pending = harness.command(TakeoffBehaviour(4.0))
-    for _ in range(round((BASE_TIMEOUT_S + 10.0) / 0.04)):
-        harness.vehicle.position[2], harness.vehicle.landed = 0.0, LandedState.ON_GROUND
-        harness.autopilot.step(0.04)
-        harness.vehicle.position[2], harness.vehicle.landed = 0.0, LandedState.ON_GROUND
-        harness.step()
-    assert not pending.result().success
+    return harness
+
+
+def assert_disarmed(harness: GuidanceHarness) -> None:
+    harness.run(1.0)
     assert harness.autopilot.requests[-1] == "disarm"
+    assert not harness.vehicle.armed
+    assert harness.guidance.phase is Phase.IDLE
+    assert harness.outputs[-1].setpoint is None
+
+
+@pytest.mark.parametrize("altitude_m", [4.0, LOW_M])
+def test_takeoff_that_never_lifts_disarms(altitude_m: float) -> None:
+    harness = on_ground()
+    assert not harness.outcome(harness.command(TakeoffBehaviour(altitude_m))).success
+    assert_disarmed(harness)
+
+
+@pytest.mark.parametrize("on_failure", ["abort", "continue"])
+def test_low_takeoff_of_a_mission_that_never_lifts_disarms(on_failure: str) -> None:
+    harness = on_ground()
+    steps = mission(harness, f"takeoff {LOW_M}", "takeoff 4", on_failure=on_failure)
+    assert harness.outcome(harness.command(steps)).success is (on_failure == "continue")
+    assert_disarmed(harness)
+
+
+def test_error_in_a_low_takeoff_on_the_ground_disarms(monkeypatch: pytest.MonkeyPatch) -> None:
+    harness = on_ground()
+    behaviour = TakeoffBehaviour(LOW_M)
+    pending = harness.command(behaviour)
+    harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
+    monkeypatch.setattr(behaviour, "update", lambda dt_s, context: 1 / 0)
+    assert "ZeroDivisionError" in harness.outcome(pending).reason
+    assert_disarmed(harness)
+
+
+def test_position_lost_in_a_low_takeoff_on_the_ground_disarms() -> None:
+    harness = on_ground()
+    pending = harness.command(TakeoffBehaviour(LOW_M))
+    harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
+    harness.autopilot.position_alive = False
+    assert "position" in harness.outcome(pending).reason
+    assert_disarmed(harness)
 
 
 def test_stop_before_the_takeoff_disarms() -> None:
