@@ -72,8 +72,8 @@ def _heartbeat(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState
 
 def _current_mode(state: VehicleState, fields: Fields, _now_ns: int) -> VehicleState:
     mode = _mode(fields)
-    if mode is FlightMode.UNKNOWN:
-        return state
+    if mode is FlightMode.UNKNOWN and not fields.get("custom_mode"):
+        return state  # not filled in yet. A number without a name here is another mode than the one before
     intended, beside = state.intended_mode, state.intended_beside
     if "intended_custom_mode" in fields:
         intended, beside = mode_of_custom_mode(fields["intended_custom_mode"]), mode

@@ -22,6 +22,7 @@ from companion.vehicle.state import FlightMode
 from tests.companion.vehicle.fake_autopilot import HOLD, MISSION, FakeAutopilot, wait_for_state, wait_until
 
 pytestmark = [pytest.mark.usefixtures("short_measurement"), pytest.mark.realtime]
+ORBIT, EXTERNAL = 0x01030000, 0x0B040000  # of PX4; they have no name here
 
 
 async def test_arm_returns_when_the_vehicle_reports_it(driver: Driver, autopilot: FakeAutopilot) -> None:
@@ -123,6 +124,27 @@ async def test_pilots_mode_ends_the_repetition(driver: Driver, autopilot: FakeAu
     autopilot.answers["COMMAND_LONG"] = pilot
     with pytest.raises(TakenOverError, match="the pilot took over: mission mode"):
         await driver.set_mode(FlightMode.LAND, timeout_s=60.0)
+    await driver.settle()
+    assert len([m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]) == 1
+
+
+@pytest.mark.parametrize("mode", [ORBIT, EXTERNAL])
+async def test_pilots_mode_without_a_name_here_ends_the_repetition(
+    driver: Driver, autopilot: FakeAutopilot, mode: int
+) -> None:
+    """Only CURRENT_MODE reports it, as between two heartbeats of PX4."""
+
+    def changed(message: Any) -> None:
+        if message.command == 176:
+            autopilot.sends_heartbeats = False
+            payload = struct.pack("<IIB", mode, mode, 0)
+            frame = pack_frame(CURRENT_MODE_ID, payload, system_id=1, component_id=1, sequence=9)
+            for tick in range(10):
+                asyncio.get_running_loop().call_later(0.1 * tick, autopilot.send_bytes, frame)
+
+    autopilot.answers["COMMAND_LONG"] = changed
+    with pytest.raises(TakenOverError):
+        await driver.set_mode(FlightMode.LAND)
     await driver.settle()
     assert len([m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]) == 1
 

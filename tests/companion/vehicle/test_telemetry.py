@@ -41,7 +41,15 @@ def test_message_without_change_returns_the_same_object() -> None:
     assert apply_message(state, "BATTERY_STATUS", {"id": 1, "battery_remaining": 50}, 2) is state
 
 
-def test_unknown_current_mode_is_ignored() -> None:
+@pytest.mark.parametrize("number", [0x01030000, 0x0B040000, 0x12040000], ids=["orbit", "external", "last"])
+def test_current_mode_without_a_name_here_is_another_mode(number: int) -> None:
+    state = apply_message(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
+    state = apply_message(state, "CURRENT_MODE", {"custom_mode": number, "intended_custom_mode": number}, 2)
+    assert (state.mode, state.custom_mode) == (FlightMode.UNKNOWN, number)
+    assert state.intended_beside is state.intended_mode is FlightMode.UNKNOWN
+
+
+def test_empty_current_mode_is_ignored() -> None:
     state = apply_message(VehicleState(), "HEARTBEAT", HEARTBEAT, 1)
     state = apply_message(state, "CURRENT_MODE", {"custom_mode": 0x06040000}, 2)
     assert state.mode is FlightMode.LAND
