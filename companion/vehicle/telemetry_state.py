@@ -45,7 +45,6 @@ class TelemetryState:
         state: the newest snapshot.
         profile: the profile of the connected autopilot.
         clock: synchronisation of its clock with ours.
-        mode_ns: when it last reported its mode, CLOCK_MONOTONIC.
         restarted: set when it has restarted; cleared by the link's supervision.
         restart_count: how often it has restarted.
         answered_ns: when the newest answered TIMESYNC request was sent, CLOCK_MONOTONIC.
@@ -71,7 +70,6 @@ class TelemetryState:
         )
         self.profile: AutopilotProfile = Px4Profile()
         self.clock = ClockSync()
-        self.mode_ns = 0
         self.restart_count = self.answered_ns = 0
         self.restarted = asyncio.Event()
         self._boot_ms: dict[str, int] = {}
@@ -99,8 +97,6 @@ class TelemetryState:
             if not self.state.connected(now_ns):  # what answers after a silence may be another vehicle
                 self.state = replace(self.state, vtol_state=None, is_plane=None)
             self._watch_booting(fields["system_status"] == _BOOTING)
-        if name in ("HEARTBEAT", "CURRENT_MODE"):
-            self.mode_ns = now_ns
         if name in _KINEMATIC and self.two_autopilots(now_ns):
             return  # Its sender is ambiguous: the state becomes stale, and what needs it ends.
         stamped = "time_boot_ms" in fields and name != _OLD_STAMPED
