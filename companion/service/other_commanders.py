@@ -5,7 +5,8 @@ detected by its HEARTBEAT, which the autopilot forwards from its other links (`v
 its `status` under the same name on the network. The one with the longer uptime may engage; the other refuses.
 
 Any program that commands the vehicle is also detected by its effect: an acknowledgement, to our address, of a
-command that we did not send; on PX4 also OFFBOARD, which it leaves without setpoints, while we send none.
+command that we did not send; on PX4 also OFFBOARD, which it leaves without setpoints, while we send none. Not
+where its parameters let it stay there.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from companion.guidance.limits.battery import needs_charge
 from companion.peer_data import PeerDataError, parse_object
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.gimbal import Address, address_text
+from companion.vehicle.silence import SilenceEffect, SilenceOutcome
 from companion.vehicle.state import FlightMode, VehicleState
 
 FOREIGN_COMMAND = "commands with our own address"
@@ -27,8 +29,9 @@ FOREIGN_OFFBOARD = "setpoints in OFFBOARD"
 GONE_AFTER_S = 3.5
 # Uptimes are whole seconds, and delayed: of two services started this close together neither is the first.
 SAME_START_S = 2.0
-# PX4 leaves OFFBOARD after COM_OF_LOSS_T without setpoints, 1 s by default.
-FOREIGN_OFFBOARD_S = 5.0
+# PX4 leaves OFFBOARD after COM_OF_LOSS_T without setpoints, 1 s by default. It counts after this time, or the
+# margin beyond a longer COM_OF_LOSS_T.
+FOREIGN_OFFBOARD_S, LOSS_MARGIN_S = 5.0, 2.0
 # Services known by their status.
 MOST_SERVICES = 16
 
@@ -74,6 +77,7 @@ class OtherCommanders:
         self._address: Address = (settings.system_id, settings.component_id)
         self._shared = False
         self._offboard_since_ns: int | None = None
+        self._foreign_after_s = FOREIGN_OFFBOARD_S
 
     def uptime_s(self, now_ns: int) -> float:
         """Uptime of this service, seconds."""
@@ -120,7 +124,7 @@ class OtherCommanders:
         commanded_ns, since_ns = state.foreign_command_ns, self._offboard_since_ns
         if commanded_ns and _is_recent(commanded_ns, now_ns):
             found.append(_Other("mavlink", FOREIGN_COMMAND, commanded_ns, commanded_ns, True))
-        if since_ns is not None and now_ns - since_ns >= FOREIGN_OFFBOARD_S * 1e9:
+        if since_ns is not None and now_ns - since_ns >= self._foreign_after_s * 1e9:
             found.append(_Other("mavlink", FOREIGN_OFFBOARD, now_ns, since_ns, True))
         return found
 
@@ -128,14 +132,20 @@ class OtherCommanders:
         """Whether another program has sent lately with our MAVLink address."""
         return state.address_shared_ns > 0 and _is_recent(state.address_shared_ns, now_ns)
 
-    def watch(self, state: VehicleState, now_ns: int, *, in_command: bool = False) -> None:
+    def watch(
+        self, state: VehicleState, now_ns: int, silence: SilenceOutcome, *, in_command: bool = False
+    ) -> None:
         """Report services that have appeared or disappeared, once each; call it once a second.
 
         Args:
+            silence: what the autopilot does without setpoints.
             in_command: whether we are in command.
         """
         self._watch_address(state, now_ns)
+        self._foreign_after_s = max(FOREIGN_OFFBOARD_S, (silence.after_s or 0.0) + LOSS_MARGIN_S)
         flies_setpoints = state.autopilot == "PX4" and state.mode is FlightMode.OFFBOARD and state.armed
+        if silence.effect is SilenceEffect.FLY_ON:  # in OFFBOARD it stays there without setpoints too
+            flies_setpoints = False
         if in_command or not flies_setpoints or not state.connected(now_ns):
             self._offboard_since_ns = None
         elif self._offboard_since_ns is None:

@@ -16,12 +16,12 @@ from companion.perception.cameras import PerceptionCamera
 from companion.service.factory import guidance_options
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
-from companion.service.other_commanders import OtherCommanders
+from companion.service.other_commanders import FOREIGN_OFFBOARD, OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
 from companion.vehicle.driver import CommandRefusedError, Driver
-from companion.vehicle.state import VehicleState
+from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VtolState
 
 
@@ -261,6 +261,19 @@ def test_shared_address_is_changed_only_while_not_in_command(in_command: bool) -
     driver.state = VehicleState(address_shared_ns=1)
     health.after_step(10**9, cast(Guidance, SimpleNamespace(in_command=in_command, status="")))
     assert driver.changes == (0 if in_command else 1)
+
+
+@pytest.mark.parametrize(("lost", "counts"), [(2.0, True), (0.0, False)])
+async def test_offboard_counts_as_anothers_by_the_parameters(lost: float, counts: bool) -> None:
+    health, driver, _, events = health_of("PX4", {**PX4_VALUES, "NAV_RCL_ACT": lost}, FirmwareVersion(1, 18))
+    health.after_step(0, guidance())
+    await health.check()
+    for second in range(1, 12):
+        driver.state = VehicleState(
+            autopilot="PX4", mode=FlightMode.OFFBOARD, armed=True, heartbeat_ns=second * 10**9
+        )
+        health.after_step(second * 10**9, guidance())
+    assert bool(said(events, about=FOREIGN_OFFBOARD)) is counts
 
 
 async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:

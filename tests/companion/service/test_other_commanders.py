@@ -18,10 +18,13 @@ from companion.guidance.interface import CommandInput
 from companion.peer_data import PeerDataError
 from companion.service.other_commanders import FOREIGN_OFFBOARD, OtherCommanders
 from companion.settings.vehicle import VehicleSection
+from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
 from companion.vehicle.commander import Commander
+from companion.vehicle.silence import SilenceOutcome, silence_outcome
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
 from tests.companion.live_flight import LiveFlight
+from tests.companion.service.test_health import PX4_VALUES
 from tests.companion.service_process import TWICE
 
 S = 1_000_000_000
@@ -35,6 +38,17 @@ class Here(OtherCommanders):
         self.events: list[tuple[str, str]] = []
         settings = VehicleSection(allow_other_commander=allowed)
         super().__init__(settings, "here", NOW_NS - 100 * S, lambda *event: self.events.append(event))
+
+    def watch(
+        self,
+        state: VehicleState,
+        now_ns: int,
+        silence: SilenceOutcome | None = None,
+        *,
+        in_command: bool = False,
+    ) -> None:
+        silence = silence or silence_outcome(NOTHING_READ, sticks_present=False)
+        super().watch(state, now_ns, silence, in_command=in_command)
 
     def reason(
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
@@ -163,6 +177,30 @@ def test_setpoints_of_another_program_are_noticed_on_px4(
     command = CommandInput(1, "hold", HoldBehaviour())
     refused = here.check_requirements(command, state, in_command=False, now_ns=now_ns)
     assert (refused is not None) is noticed
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sticks_present", "noticed_after_s"),
+    [
+        ({}, False, 5),
+        ({"NAV_RCL_ACT": 0.0}, False, None),  # it stays in OFFBOARD
+        ({"NAV_RCL_ACT": 7.0}, False, None),
+        ({"NAV_RCL_ACT": 0.0}, True, 5),  # it changes to position mode
+        ({"COM_OF_LOSS_T": 10.0}, False, 13),
+    ],
+)
+def test_offboard_counts_where_px4_would_have_left_it(
+    parameters: dict[str, float], sticks_present: bool, noticed_after_s: int | None
+) -> None:
+    known = tuple((PX4_VALUES | parameters).items())
+    read = AutopilotParameters("PX4", FirmwareVersion(1, 18), 1, known)
+    silence = silence_outcome(read, sticks_present=sticks_present)
+    here = Here()
+    for second in range(60):
+        now_ns = NOW_NS + second * S
+        here.watch(offboard(now_ns), now_ns, silence)
+        noticed = noticed_after_s is not None and second >= noticed_after_s
+        assert bool(here.present(offboard(now_ns), now_ns)) is noticed, second
 
 
 def test_brief_offboard_of_ours_is_no_other_commander() -> None:
