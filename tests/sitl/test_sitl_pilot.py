@@ -21,15 +21,19 @@ RETURN = {PX4: 4 << 16 | 5 << 24, ARDUPILOT: 6}
 WATCHED_S = 4.0
 COMMANDS = ("hold", "goto forward=20 right=0", "orbit radius=6 speed=2", "follow-path 0,0 20,0 20,20 speed=2")
 MODES = {"land": LAND, "rtl": RETURN}
-DELAYS_S = {"requested": 0.1, "flown": 1.5}
+DELAYS_S, UNASKED_S = {"requested": 0.1, "flown": 1.5}, 0.5
 
 
 def changed_when(link: AutopilotLink, moment: str, mode: int) -> Iterator[None]:
-    """The pilot's change, once: a moment after the service's first request, or when its mode is flown."""
-    requests, since_s = len(link.commands), None
+    """The pilot's change, once: a moment after the service's first request, or when its mode is flown.
+
+    In OFFBOARD already, as after a take-off that it has finished, the service requests no mode.
+    """
+    requests, begun_s, since_s = len(link.commands), time.monotonic(), None
     while since_s is None:
         yield
-        if any(number == dialect.MAV_CMD_DO_SET_MODE for _, number in link.commands[requests:]):
+        asked = any(number == dialect.MAV_CMD_DO_SET_MODE for _, number in link.commands[requests:])
+        if asked or time.monotonic() - begun_s > UNASKED_S:
             since_s = time.monotonic()
     while time.monotonic() - since_s < DELAYS_S[moment]:
         yield
