@@ -215,7 +215,7 @@ class AutopilotDriver(ABC):
     async def _identify(self) -> None:
         """Find out whether an ArduPilot that reports a multicopter's type is a quadplane (`vehicle_type`).
 
-        Without an answer it is not known, and nothing is flown.
+        Without an answer it is not known, and nothing that moves the vehicle is sent.
         """
         if self._autopilot_kind != ARDUPILOT:
             return
@@ -236,7 +236,7 @@ class AutopilotDriver(ABC):
             await self._telemetry.until(due, None)
             await self._identify()
             if self._telemetry.state.is_plane is None:
-                await asyncio.sleep(_IDENTIFY_PERIOD_S)  # a refusal may come at once
+                await asyncio.sleep(_IDENTIFY_PERIOD_S)  # an error may come at once
 
     def _start_tasks(self) -> None:
         name = self._telemetry.profile.name

@@ -226,11 +226,11 @@ async def test_no_command_until_copter_or_plane_has_answered() -> None:
         with pytest.raises(CommandRefusedError, match="FRAME_CLASS"):
             await driver.set_mode(FlightMode.HOLD)
         assert not [m for m in autopilot.received_named("COMMAND_LONG") if m.command == 176]
-        told: list[bool | None] = []
-        driver.subscribe(lambda state: told.append(state.is_plane))
+        reported: list[bool | None] = []
+        driver.subscribe(lambda state: reported.append(state.is_plane))
         autopilot.parameters = parameters
         await wait_for_state(driver, lambda state: state.not_flown is None)
-        assert told[-1] is False
+        assert reported[-1] is False
         driver.discard_received()
         assert driver.state.is_plane is None
         await wait_for_state(driver, lambda state: state.is_plane is False)
