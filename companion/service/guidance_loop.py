@@ -91,7 +91,7 @@ class GuidanceLoop:
                 command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
             ),
         )
-        self._ending = False
+        self._running = self._ending = False
         self._slow: tuple[str, int] = ("", 0)
 
     async def execute(self, text: str) -> dict[str, Any]:
@@ -105,6 +105,7 @@ class GuidanceLoop:
 
     async def run(self) -> None:
         """Run until cancelled."""
+        self._running = True
         try:
             while True:
                 now_ns = time.monotonic_ns()
@@ -115,6 +116,7 @@ class GuidanceLoop:
                 self._on_step(now_ns)
                 await self._wait_for_input_until(now_ns / 1e9 + self._period_s)
         finally:
+            self._running = False
             self._driver.watch.end_of_loop()
 
     async def shut_down(self) -> None:
@@ -173,6 +175,8 @@ class GuidanceLoop:
         self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
         self._apply(output)
         self._driver.watch.acknowledge(seen)
+        if not self._running:  # a step of the shutdown: the next one may be seconds later
+            self._driver.watch.end_of_loop()
         context = self._inputs.step_context(self.guidance.gimbal.mounting)
         self._record(now_ns, context, inputs, output)
         return output

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from types import SimpleNamespace
@@ -86,23 +87,7 @@ class LoopHarness:
             if self.vehicle.now_ns >= end_ns:
                 over.set()
 
-        loop = GuidanceLoop(
-            self.harness.guidance,
-            self._inputs(),
-            SimpleNamespace(
-                state=self.harness.autopilot.state,
-                watch=self.watch,
-                abandon=lambda why: self.discarded.append("pending"),
-                discard_received=lambda: self.discarded.append("driver"),
-                send_landing_target=None,
-                send_obstacle_distance=None,
-            ),
-            self.streamer,
-            rate_hz=1 / STEP_S,
-            on_event=lambda level, text: self.events.append(text),
-            on_step=on_step,
-            others=SimpleNamespace(),  # type: ignore[arg-type]
-        )
+        loop = self._loop(on_step)
         tasks = [asyncio.create_task(loop.run()), asyncio.create_task(self.streamer.run())]
         ended = asyncio.create_task(over.wait())
         done, _ = await asyncio.wait([*tasks, ended], return_when=asyncio.FIRST_COMPLETED)
@@ -110,6 +95,37 @@ class LoopHarness:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
         assert done == {ended}, [task.exception() for task in done - {ended}]
+
+    async def crash_and_shut_down(self) -> None:
+        """A step raises, and the shutdown begins."""
+
+        def crash(now_ns: int) -> None:
+            raise ZeroDivisionError
+
+        loop = self._loop(crash)
+        with contextlib.suppress(ZeroDivisionError):
+            await loop.run()
+        loop.begin_shutdown()
+
+    def _loop(self, on_step: Callable[[int], None]) -> GuidanceLoop:
+        driver: Any = SimpleNamespace(
+            state=self.harness.autopilot.state,
+            watch=self.watch,
+            abandon=lambda why: self.discarded.append("pending"),
+            discard_received=lambda: self.discarded.append("driver"),
+            send_landing_target=None,
+            send_obstacle_distance=None,
+        )
+        return GuidanceLoop(
+            self.harness.guidance,
+            self._inputs(),
+            driver,
+            self.streamer,
+            rate_hz=1 / STEP_S,
+            on_event=lambda level, text: self.events.append(text),
+            on_step=on_step,
+            others=SimpleNamespace(),  # type: ignore[arg-type]
+        )
 
     def _inputs(self) -> Any:
         autopilot = self.harness.autopilot
@@ -210,3 +226,12 @@ async def test_short_suspend_changes_nothing(loop: LoopHarness) -> None:
     assert loop.discarded == []
     assert loop.harness.guidance.in_command
     assert {state for sent_ns, state in loop.sent if sent_ns > at_ns + 100 * MS} == {StreamState.FRESH}
+
+
+async def test_shutdown_after_a_crash_may_request_for_long(loop: LoopHarness) -> None:
+    """A pilot's mode is requested again up to 3 s after the request that overrode it."""
+    await loop.crash_and_shut_down()
+    loop.vehicle.now_ns += 3_500 * MS
+    assert loop.watch.observe().standstill is None
+    loop.suspended_ns = 400 * MS
+    assert loop.watch.observe().standstill is not None
