@@ -1,22 +1,24 @@
 """Queue of commands: one that needs a gimbal, home or detections waits for the first report of it.
 
 The gimbal manager is asked; PX4 sends home every two seconds; a camera that has just started sends its first
-detections within seconds.
+detections within seconds. After a standstill `stop`, `land` and `rtl` wait for the next heartbeat.
 
 A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
-battery, or the end of the service.
+battery, or the end of the service. The mode in the first heartbeat after a standstill supersedes nothing.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from companion.guidance.behaviour import BehaviourContext, Outcome, Requirement
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome, Requirement
+from companion.guidance.behaviours.land import LandBehaviour
+from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
 
-_GIMBAL = "the gimbal"
+_GIMBAL, _HEARTBEAT = "the gimbal", "the autopilot's next heartbeat"
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +26,11 @@ class _Waiting:
     command: CommandInput
     until_ns: float
     awaited: str
+
+
+def ends_flight(behaviour: Behaviour | None) -> bool:
+    """Whether it is accepted in every mode, also directly after a standstill."""
+    return isinstance(behaviour, StopBehaviour | LandBehaviour)
 
 
 class CommandQueue:
@@ -65,7 +72,10 @@ class CommandQueue:
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
         """Supersede waiting commands after a change of mode or arming."""
         if self._mode_changes is not None and mode_changes != self._mode_changes:
+            unknown = [waiting for waiting in self._waiting if waiting.awaited == _HEARTBEAT]
+            self._waiting = [waiting for waiting in self._waiting if waiting.awaited != _HEARTBEAT]
             self.supersede(_change(state), out)
+            self._waiting += unknown
         self._mode_changes = mode_changes
 
     def supersede(self, by: str, out: OutputCollector) -> None:
@@ -108,6 +118,8 @@ class CommandQueue:
 def _awaited(command: CommandInput, context: BehaviourContext) -> str:
     """What the command waits for, in words; empty: nothing."""
     behaviour = command.behaviour
+    if ends_flight(behaviour) and not context.state.heartbeat_ns:
+        return _HEARTBEAT
     needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.requirements)
     for later in () if behaviour is None else behaviour.later:
         needed |= later.requirements

@@ -18,9 +18,8 @@ from dataclasses import dataclass, replace
 from companion.clock import BUFFERED_S, Standstill
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviour_runner import BehaviourRunner
-from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
-from companion.guidance.command_queue import CommandQueue
+from companion.guidance.command_queue import CommandQueue, ends_flight
 from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
 from companion.guidance.interface import (
     CommandInput,
@@ -247,7 +246,7 @@ class Guidance:
         A command that was sent to a process that stands still waits in a buffer, and arrives when it goes on;
         one that was sent to a suspended computer is sent again by its sender's TCP.
         """
-        if isinstance(command.behaviour, StopBehaviour | LandBehaviour):
+        if ends_flight(command.behaviour):
             return None
         if standstill is None and now_ns < self._refuse_until_ns:
             standstill = self._standstill

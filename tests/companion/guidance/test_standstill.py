@@ -222,6 +222,48 @@ def test_commands_that_end_a_flight_are_not_refused(
     assert not harness.command(behaviour()).done()
 
 
+class SilentUntilHeard:
+    """The state as `TelemetryState.discard_received` leaves it, until `heard`."""
+
+    heard = False
+
+    def __call__(self, inputs: GuidanceInput) -> GuidanceInput:
+        state = inputs.state if self.heard else replace(inputs.state, heartbeat_ns=0, position_ns=0)
+        return replace(with_leader(inputs), state=state)
+
+
+@pytest.mark.parametrize("mode", [FlightMode.OFFBOARD, FlightMode.RETURN])
+@pytest.mark.parametrize("behaviour", [StopBehaviour, LandBehaviour, ReturnBehaviour])
+def test_commands_that_end_a_flight_wait_for_a_heartbeat(
+    behaviour: type[StopBehaviour] | type[LandBehaviour], mode: FlightMode
+) -> None:
+    harness = _flown("goto 60 0")()
+    harness.stand_still(4.0, suspended=True)
+    harness._inputs = silent = SilentUntilHeard()
+    pending = harness.command(behaviour())
+    harness.run(0.9)
+    assert not pending.done()
+    # PX4 has left OFFBOARD meanwhile: the heartbeat shows a mode that was chosen before the command.
+    harness.autopilot.change_mode(mode)
+    harness.run(0.4)
+    assert not pending.done()
+    silent.heard = True
+    assert harness.outcome(pending).success
+    assert harness.autopilot.requests[-1] == {"land": "land", "rtl": "return", "stop": "hold"}[behaviour.name]
+
+
+@pytest.mark.parametrize("newer", [HoldBehaviour, StopBehaviour])
+def test_command_without_a_heartbeat_is_answered(newer: type[HoldBehaviour] | type[StopBehaviour]) -> None:
+    harness = _flown("goto 60 0")()
+    harness.stand_still(1.0, suspended=True)
+    harness._inputs = SilentUntilHeard()
+    pending = harness.command(StopBehaviour())
+    second = harness.command(newer())
+    assert "superseded" in pending.result().reason
+    harness.run(5.0)
+    assert "no link" in second.result().reason
+
+
 def test_pilot_flies_on_after_a_standstill() -> None:
     harness = _flown("goto 60 0")()
     harness.autopilot.change_mode(FlightMode.POSITION)
