@@ -155,6 +155,11 @@ class Guidance:
         return self.phase is not Phase.IDLE
 
     @property
+    def armed_on_ground(self) -> bool:
+        """Whether the active command has armed the vehicle, and it has not taken off since."""
+        return self._modes.armed_on_ground
+
+    @property
     def status(self) -> str:
         """A few words for people."""
         behaviour = self.behaviour

@@ -22,7 +22,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
 from companion.vehicle.silence import silence_outcome
-from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 
 # Reported with the command's own result.
@@ -120,16 +120,20 @@ class GuidanceLoop:
             self._driver.watch.end_of_loop()
 
     async def shut_down(self) -> None:
-        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD."""
+        """Accept no more commands; switch a vehicle that flies our setpoints to the autopilot's HOLD.
+
+        One that we have armed and that is still on the ground is disarmed instead.
+        """
         state = self._driver.state
+        on_ground = self.guidance.armed_on_ground and state.landed is LandedState.ON_GROUND
         mode = mode_at_shutdown(state, self.guidance.phase, self._streamer.state)
         try:
             self.begin_shutdown()
         finally:
             self._streamer.stop()
             try:
-                if mode is not None and self._driver.state.connected(time.monotonic_ns()):
-                    await self._driver.set_mode(mode, timeout_s=2.0, since=state)
+                if self._driver.state.connected(time.monotonic_ns()):
+                    await self._leave(state, mode, on_ground=on_ground)
             except TakenOverError as error:
                 self._on_event("warning", f"shutdown: {error}")
                 await self._driver.settle()
@@ -139,6 +143,19 @@ class GuidanceLoop:
                 self._on_event("error", f"shutdown: {error}; {outcome.text}")
             finally:
                 await self.wait_released()
+
+    async def _leave(self, state: VehicleState, mode: FlightMode | None, *, on_ground: bool) -> None:
+        """Disarm on the ground; if that is refused, or in the air, request the mode."""
+        if on_ground:
+            try:
+                await self._driver.disarm(since=state)
+                return
+            except CommandRefusedError as error:
+                if mode is None or isinstance(error, TakenOverError):
+                    raise
+                self._on_event("warning", f"shutdown: {error}")
+        if mode is not None:
+            await self._driver.set_mode(mode, timeout_s=2.0, since=state)
 
     def begin_shutdown(self) -> None:
         """Accept no more commands and stream nothing from now on. `run` continues."""

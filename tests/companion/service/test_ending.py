@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import pty
 import signal
@@ -14,11 +15,14 @@ from typing import Any
 
 import pytest
 
+from companion.vehicle.state import LandedState
 from mavlink_sim.testing import running_simulator
+from tests.companion.live_flight import LiveFlight
 from tests.companion.service_process import TWICE, ServiceProcess, running_service
 
 pytestmark = pytest.mark.realtime
 
+LOW_M = 2.0  # flown by setpoints from the ground
 NO_CAMERA = ("--source", "none")
 # Ends as a program that flies, when its reader or a signal says so; 7: it was ended in order.
 PROGRAM = """
@@ -76,6 +80,26 @@ def test_ending_in_flight_requests_hold(way: str, tmp_path: Path) -> None:
     assert [reply["success"] for reply in replies] == [False]
     if way != "terminal":
         os.close(terminal)
+
+
+@pytest.mark.parametrize("altitude_m", [LOW_M, 6.0])
+@pytest.mark.parametrize("arming", [True, False], ids=["arming", "armed"])
+async def test_ending_on_the_ground_disarms_what_it_armed(altitude_m: float, arming: bool) -> None:
+    """PX4 would disarm by itself after COM_DISARM_PRFLT, 10 s."""
+    with running_simulator() as simulator:
+        flight = LiveFlight("pymavlink", simulator.onboard_port)
+        async with flight.running():
+            await flight.until(lambda: flight.driver.state.ready_to_arm)
+            asking = asyncio.create_task(flight.fly(f"takeoff {altitude_m}"))
+            if arming:
+                await flight.until(lambda: flight.guidance.armed_on_ground)
+            else:
+                await flight.until(lambda: flight.driver.state.armed)
+            await asyncio.wait_for(flight.loop.shut_down(), 5.0)
+            await flight.until(lambda: not flight.driver.state.armed, 2.0)
+            assert flight.driver.state.landed is LandedState.ON_GROUND
+            assert not (await asking).success
+        assert [text for level, text in flight.events if level == "error"] == []
 
 
 @pytest.mark.parametrize("way", ["SIGINT", "SIGTERM", "SIGHUP", "reader"])
