@@ -45,7 +45,7 @@ class BehaviourRunner:
         behaviour: the active behaviour, including the hold between commands; None: none.
         active: the same, inside a sequence its current one; None: none has been updated yet.
         busy: a commanded behaviour has not ended yet.
-        approached: the object that it flies to; None: none.
+        approached: the object that it flies to; None: none. needs: the requirements of `active`.
         gimbal_user: name of the behaviour that moves the gimbal; empty: none.
         goal_ned_m: where the behaviour before wanted the vehicle; None: unknown.
         failure: exception of the step before, in words; empty: none.
@@ -67,6 +67,7 @@ class BehaviourRunner:
         self.active: Behaviour | None = None
         self.gimbal_user = ""
         self.approached: Approached | None = None
+        self.needs: frozenset[Requirement] = frozenset()
         self._landing = False
         self._taken_from: FlightMode | None = None
         self._took_over = ""
@@ -165,6 +166,7 @@ class BehaviourRunner:
         after_battery, self._after_battery = self._after_battery, False
         self.behaviour = self._command = self.active = self.approached = None
         self.busy, self._landing, self.gimbal_user = False, False, ""
+        self.needs = frozenset()
         if behaviour is None:
             return
         if self._activated:
@@ -186,7 +188,7 @@ class BehaviourRunner:
         self._activated, self._position_lost_ns = False, None
         self._setpoints.begin()
         self.active, self._landing, self.gimbal_user = None, False, ""
-        self.approached = None
+        self.approached, self.needs = None, frozenset()
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
@@ -208,7 +210,7 @@ class BehaviourRunner:
             offboard = self._modes.phase is Phase.OFFBOARD
             step = self._setpoints.steer(step, context, behaviour.name, offboard=offboard)
         self.active = active = behaviour.active
-        self._landing, self.approached = active.landing, active.approached
+        self._landing, self.approached, self.needs = active.landing, active.approached, active.requirements
         self.gimbal_user = active.name if active.gimbal_aim is not None else ""
         match step:
             case Outcome():

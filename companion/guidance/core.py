@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, replace
 
 from companion.clock import BUFFERED_S, Standstill
-from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
+from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome, Requirement
 from companion.guidance.behaviour_runner import BehaviourRunner
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command_queue import CommandQueue, ends_flight
@@ -36,16 +36,16 @@ from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.guidance.targets.chosen import RecentTracks
 from companion.guidance.targets.closing_check import ClosingCheck
-from companion.guidance.targets.target import Target
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
-from companion.vehicle.state import VehicleState
 from vision.obstacle_sectors import ObstacleSectors
 from vision.occupancy_grid import Point
 
 logger = logging.getLogger(__name__)
 
 OBSTACLE_DISTANCE_PERIOD_NS = 100_000_000
+# Behaviours with one of these use what the steering camera shows.
+_STEERED = frozenset({Requirement.PERCEPTION, Requirement.STEERING_MARKER})
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +85,8 @@ class Guidance:
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
-        self._closing = ClosingCheck()
+        # Of the steering camera, and of those that look down.
+        self._closing, self._closing_below = ClosingCheck(), ClosingCheck()
         self._approaching: Behaviour | None = None
         self._context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
@@ -295,23 +296,34 @@ class Guidance:
             camera_fault=inputs.camera_fault,
             parameters=inputs.parameters,
         )
-        fault = self._check_closing(inputs.state, targets)
-        return context if not fault else _blinded(context, fault)
+        return self._without_wrong_cameras(context)
 
-    def _check_closing(self, state: VehicleState, targets: tuple[Target, ...]) -> str:
-        """What is wrong with the distance to the object that is flown to, in words; empty: nothing."""
+    def _without_wrong_cameras(self, context: BehaviourContext) -> BehaviourContext:
+        """The context without what a camera shows that does not fit the vehicle's motion (`ClosingCheck`)."""
+        active, position = self._runner.active, context.state.position_ned_m
         if not self._runner.busy:
             self._closing.reset()
-        known, position = self._closing.fault, state.position_ned_m
-        if known or position is None:
-            return known
-        if self._runner.active is not self._approaching:  # the next step of a mission: another object
-            self._approaching = self._runner.active
+            self._closing_below.reset()
+        if active is not self._approaching:  # the next step of a mission: another object
+            self._approaching = active
             self._closing.begin_again()
-        fault = self._closing.update(self._runner.approached, targets, state.position_ns, position)
-        if fault and (behaviour := self._runner.behaviour) is not None:
-            self._out.event(EventKind.NOTED, behaviour.name, fault, warning=True)
-        return fault
+            self._closing_below.begin_again()
+        if position is not None:
+            needs, stamp_ns = self._runner.needs, context.state.position_ns
+            below = Requirement.MARKER in needs
+            ahead, beneath = (None, self._runner.approached) if below else (self._runner.approached, None)
+            known = self._closing.fault, self._closing_below.fault
+            self._closing.update(ahead, context.targets, stamp_ns, position, used=bool(needs & _STEERED))
+            self._closing_below.update(beneath, (), stamp_ns, position)
+            for before, fault in zip(known, (self._closing.fault, self._closing_below.fault), strict=True):
+                if fault and not before and (behaviour := self._runner.behaviour) is not None:
+                    self._out.event(EventKind.NOTED, behaviour.name, fault, warning=True)
+        if self._closing.fault:
+            context = _blinded(context, self._closing.fault)
+        if fault := self._closing_below.fault:
+            markers = replace(context.markers, targets=(), fresh=False, fault=fault)
+            context = replace(context, markers=markers)
+        return context
 
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:
         out = self._out
@@ -346,6 +358,7 @@ class Guidance:
             self._out.event(EventKind.REFUSED, behaviour.name, f"refused: {missing}", outcome)
             return
         self._closing.reset()
+        self._closing_below.reset()
         self._runner.begin_command(behaviour, command, context)
         if isinstance(behaviour, StopBehaviour):
             self.gimbal.end_goal(behaviour.name, self._out)
@@ -373,14 +386,17 @@ class Guidance:
 
 
 def _blinded(context: BehaviourContext, fault: str) -> BehaviourContext:
-    """The context without anything that cameras show: behaviours brake, and end with the fault."""
-    markers = replace(context.markers, targets=(), fresh=False, fault=fault)
-    steering = replace(context.steering_markers, targets=(), fresh=False, fault=fault)
+    """The context without anything that the steering camera shows: behaviours brake, and end with the fault.
+
+    Where that camera looks down, its markers are missing below too.
+    """
+    shown = context.steering_markers
+    others = tuple(target for target in context.markers.targets if target not in shown.targets)
     return replace(
         context,
         targets=(),
         perception_fresh=False,
-        markers=markers,
-        steering_markers=steering,
+        markers=replace(context.markers, targets=others),
+        steering_markers=replace(shown, targets=(), fresh=False, fault=fault),
         camera_fault=fault,
     )

@@ -3,7 +3,7 @@
 Where it does not, the camera shows an old image (a decoder that repeats it below a running clock, which is no
 identical image), the object's size is wrong, or it moves away as fast as the vehicle follows. A single
 frame does not distinguish these from an object that is still far away. And of two images of a moving camera a
-detector's boxes are never the same, whatever the objects do.
+detector's boxes are never the same, whatever the objects do, except those of the vehicle's own parts.
 """
 
 from __future__ import annotations
@@ -32,6 +32,10 @@ LEAST_SHARE = 0.25
 LEAST_FLOWN_M, SIGMAS = 1.5, 2.0
 # Boxes within this are the same. It counts for so many frames in so long, once `LEAST_FLOWN_M` were flown.
 SAME_BOX_PX, SAME_BOX_FRAMES, SAME_BOX_S = 0.1, 6, 0.5
+# A box that was never this far from where it was first seen may be a part of the vehicle, as a landing gear.
+MOVED_PX = 2.0
+# A detector that never changed an edge by less than this rounds its boxes: they may well stay the same.
+ROUNDED_PX = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +59,45 @@ class _Sample:
     sigma_m: float
 
 
+class _Box:
+    """The box of one object, from frame to frame.
+
+    Attributes:
+        newest: its newest detection. began: the first frame with these pixels, and where the vehicle was.
+        frames: with these pixels. moved: it has been elsewhere in the image.
+    """
+
+    def __init__(self, seen: Target, there: Vector3) -> None:
+        self.newest, self._first_xyxy, self.began = seen, seen.box_xyxy, (seen, there)
+        self.frames, self.moved = 1, False
+
+    def shows(self, seen: Target) -> bool:
+        """Whether a detection is of the same object."""
+        if self.newest.track_id is not None and seen.track_id is not None:
+            return self.newest.track_id == seen.track_id
+        one, other = self.newest.box_xyxy, seen.box_xyxy
+        overlap = all(max(one[i], other[i]) < min(one[i + 2], other[i + 2]) for i in (0, 1))
+        return overlap and self.newest.class_name == seen.class_name
+
+    def add(self, seen: Target, there: Vector3) -> None:
+        """A newer detection of it."""
+        self.newest = seen
+        self.frames += 1
+        if _apart_px(self.began[0].box_xyxy, seen.box_xyxy) > SAME_BOX_PX:
+            self.began, self.frames = (seen, there), 1
+            self.moved = self.moved or _apart_px(self._first_xyxy, seen.box_xyxy) > MOVED_PX
+
+    def still_m(self, there: Vector3) -> float:
+        """How far the vehicle was flown while it stayed at its pixels; 0: not for long enough to count."""
+        seen, began = self.began
+        lasts_s = (self.newest.captured_ns - seen.captured_ns) / 1e9
+        return math.dist(began, there) if lasts_s >= SAME_BOX_S and self.frames >= SAME_BOX_FRAMES else 0.0
+
+
 class ClosingCheck:
     """Compares the vehicle's way towards an object, by its own estimate, with the object's distance.
+
+    What is known of the boxes stays for the next command: a camera may have frozen before it.
 
     Attributes:
         fault: what is inconsistent, in words; empty: nothing so far. It stays until `reset`.
@@ -64,15 +105,14 @@ class ClosingCheck:
 
     def __init__(self) -> None:
         self.fault = ""
+        self._boxes: list[_Box] = []
+        self._frame_ns, self._finest_px = 0, math.inf
         self.reset()
 
     def reset(self) -> None:
         """Begin again: another command, or none."""
         self.fault = ""
         self._positions: deque[tuple[int, Vector3]] = deque(maxlen=100)
-        self._frame_ns = self._same_frames = 0
-        # The first frame with the boxes of the newest, and where the vehicle was.
-        self._same: tuple[tuple[Target, ...], Vector3] = ((), (0.0, 0.0, 0.0))
         self.begin_again()
 
     def begin_again(self) -> None:
@@ -88,6 +128,8 @@ class ClosingCheck:
         targets: tuple[Target, ...],
         position_ns: int,
         position: Vector3,
+        *,
+        used: bool = True,
     ) -> str:
         """Add the newest detections and the vehicle's position; returns `fault`.
 
@@ -96,13 +138,16 @@ class ClosingCheck:
                 next one may be another object.
             targets: of the newest frame; one that was added before changes nothing.
             position_ns, position: its stamp, and local NED metres.
+            used: the behaviour uses `targets`; else boxes that stay the same are no fault.
         """
         self._positions.append((position_ns, position))
         # An object that fills the image stays at its edges.
         boxed = tuple(t for t in targets if t.box_xyxy[2] > t.box_xyxy[0] and not (t.cut and t.cut_above))
-        if not self.fault and boxed and boxed[0].captured_ns > self._frame_ns:
+        if boxed and boxed[0].captured_ns > self._frame_ns:
             self._frame_ns = boxed[0].captured_ns
-            self._compare_boxes(boxed)
+            still_m = self._compare_boxes(boxed)
+            if used and not self.fault and still_m > LEAST_FLOWN_M:
+                self.fault = f"camera frozen: flown {still_m:.1f} m, and every object stays at its pixels"
         if approached is None:
             self.begin_again()
         if approached is None or self.fault:
@@ -127,16 +172,25 @@ class ClosingCheck:
             self._samples = []
         return self.fault
 
-    def _compare_boxes(self, targets: tuple[Target, ...]) -> None:
+    def _compare_boxes(self, targets: tuple[Target, ...]) -> float:
+        """How far the vehicle was flown while each box that has ever moved stayed the same; 0: not at all."""
         there = self._position_at(self._frame_ns)
-        first, began = self._same
-        if not _are_same(first, targets):
-            self._same, self._same_frames = (targets, there), 1
-            return
-        self._same_frames += 1
-        flown_m, lasts_s = math.dist(began, there), (self._frame_ns - first[0].captured_ns) / 1e9
-        if flown_m > LEAST_FLOWN_M and lasts_s >= SAME_BOX_S and self._same_frames >= SAME_BOX_FRAMES:
-            self.fault = f"camera frozen: flown {flown_m:.1f} m, and every object stays at its pixels"
+        known = [box for box in self._boxes if self._frame_ns - box.newest.captured_ns <= GAP_S * 1e9]
+        seen: list[_Box] = []
+        for target in targets:
+            fitting = [box for box in known if box.shows(target)]
+            if not fitting:
+                seen.append(_Box(target, there))
+                continue
+            box = min(fitting, key=lambda each: _apart_px(each.newest.box_xyxy, target.box_xyxy))
+            edges = zip(box.newest.box_xyxy, target.box_xyxy, strict=True)
+            self._finest_px = min([self._finest_px, *(abs(a - b) for a, b in edges if abs(a - b) > 1e-3)])
+            box.add(target, there)
+            known.remove(box)
+            seen.append(box)
+        self._boxes = known + seen
+        rounded = self._finest_px >= ROUNDED_PX
+        return 0.0 if rounded else min((box.still_m(there) for box in seen if box.moved), default=0.0)
 
     def _compare(self, newest: _Sample, name: str) -> str:
         for block in self._blocks:
@@ -155,13 +209,9 @@ class ClosingCheck:
         return min(self._positions, key=lambda sample: abs(sample[0] - stamp_ns))[1]
 
 
-def _are_same(one: Sequence[Target], other: Sequence[Target]) -> bool:
-    """Whether two frames have the same boxes."""
-    return len(one) == len(other) and all(
-        abs(a - b) <= SAME_BOX_PX
-        for first, second in zip(one, other, strict=True)
-        for a, b in zip(first.box_xyxy, second.box_xyxy, strict=True)
-    )
+def _apart_px(one: Sequence[float], other: Sequence[float]) -> float:
+    """The largest difference of two boxes' edges."""
+    return max(abs(a - b) for a, b in zip(one, other, strict=True))
 
 
 def _continues(last: Target, seen: Target) -> bool:

@@ -6,6 +6,7 @@ import math
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,17 +15,22 @@ from benchmarks import flights_land
 from benchmarks.rendered import camera_settings, rendered_scene
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
-from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_camera import Detect, SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Outcome
+from companion.guidance.interface import GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from tests.companion.guidance.guidance_harness import in_the_air
+from tests.companion.guidance.test_marker_target import pad_detection
+from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
+from vision.detections import Detections
 from vision.tracking import TrackerSettings
 
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -150,6 +156,75 @@ def test_mission_approaches_two_persons_of_one_class(tracker: TrackerSettings | 
     assert outcome is not None
     assert [record.success for record in mission.records] == [False, True]
     assert not any("camera frozen" in event.message for event in flight.events)
+
+
+def with_gear(detect: Detect | None = None) -> Detect:
+    """Detections, and a landing gear that is always at the same pixels."""
+    gear = np.array([[40.25, 380.5, 120.75, 460.25]], np.float32)
+
+    def seen(position: Vector3, attitude: Quaternion, seconds: float) -> Detections:
+        found = Detections.empty(("person",)) if detect is None else detect(position, attitude, seconds)
+        return Detections(
+            np.vstack((found.xyxy, gear)),
+            np.append(found.confidence, np.float32(0.8)),
+            np.append(found.class_id, len(found.class_names)),
+            (*found.class_names, "bird"),
+        )
+
+    return seen
+
+
+@pytest.mark.parametrize("tracker", [TrackerSettings(), None], ids=["tracks", "no tracks"])
+@pytest.mark.parametrize("command", ["goto 20 0 speed=5", "patrol 0,0 15,0 classes=person laps=1"])
+def test_a_landing_gear_in_view_is_no_frozen_camera(command: str, tracker: TrackerSettings | None) -> None:
+    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=with_gear(), tracker=tracker)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    outcome = flight.fly(command, 60.0).outcome
+    assert outcome is not None
+    assert not any("camera frozen" in event.message for event in flight.events)
+    assert outcome.success, outcome
+
+
+@pytest.mark.parametrize("fault", [EXACT, BELOW_A_CLOCK])
+def test_a_frozen_camera_with_a_landing_gear_in_view_is_found(fault: str) -> None:
+    seen = Faults(missed=0.0, false_per_frame=0.0)
+    detector = SyntheticDetector([person_at(12.0)], CAMERA, MOUNT, seed=1, faults=seen)
+    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=with_gear(detector))
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    flight.turn_to(0.0)
+    freeze = Freeze(flight, fault, 2.0).fly(BEHAVIOURS["follow"])
+    assert freeze.named
+    assert freeze.flown_m <= MAX_FLOWN_M[fault], freeze
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_frozen_camera_leaves_the_markers_of_another(shared: bool) -> None:
+    marker = pad_detection(0.0, 0.0)
+    below = MarkerSight((marker,), fresh=True, missing="")
+    seen = Faults(missed=0.0, false_per_frame=0.0)
+    detector = SyntheticDetector([person_at(12.0)], CAMERA, MOUNT, seed=1, faults=seen)
+    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    flight.turn_to(0.0)
+    assemble = flight.inputs.assemble
+
+    def with_markers(*given: Any, **named: Any) -> GuidanceInput:
+        steering = below if shared else NO_MARKERS
+        return replace(assemble(*given, **named), markers=below, steering_markers=steering)
+
+    flight.inputs.assemble = with_markers  # type: ignore[method-assign]
+    flight.fly(BEHAVIOURS["follow"], 2.0)
+    flight.vehicle.vehicle.faults.begin(BELOW_A_CLOCK)
+    for _ in range(1000):
+        flight.tick()
+        context = flight.guidance.context
+        if context is not None and context.camera_fault:
+            break
+    assert context is not None
+    assert context.camera_fault
+    assert not context.targets
+    assert context.markers.fresh
+    assert context.markers.targets == (() if shared else (marker,))
 
 
 # --- markers: drawn, so that the images themselves are identical or not

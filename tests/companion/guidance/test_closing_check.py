@@ -54,18 +54,24 @@ def flown(
     seconds: float = 6.0,
     approached: bool = True,
     cut: bool = False,
+    freezes_s: float = math.inf,
+    rounded: bool = False,
+    used: bool = True,
 ) -> tuple[str, float]:
     """The fault of a flight to an object that recedes, and how far was flown until then."""
-    check, rng, north_m = ClosingCheck(), np.random.default_rng(5), 0.0
+    check, rng, north_m, offset_px = ClosingCheck(), np.random.default_rng(5), 0.0, 0.0
     for number in range(round(seconds * 1e9 / PERIOD_NS)):
         stamp_ns = 10**9 + number * PERIOD_NS
         time_s = number * PERIOD_NS / 1e9
         north_m = speed_mps * time_s
         range_m = 15.0 + (away_mps - speed_mps) * time_s + float(rng.normal(0.0, noise_m))
-        offset_px = float(rng.uniform(-box_px, box_px))
+        if time_s < freezes_s:
+            offset_px = float(rng.uniform(-box_px, box_px))
+            offset_px = round(offset_px) if rounded else offset_px
         target = seen_at(stamp_ns, range_m, sigma_m=sigma_m, box_px=offset_px, cut=cut)
         position: Vector3 = (north_m, 0.0, -HEIGHT_M)
-        fault = check.update(Approached(target) if approached else None, (target,), stamp_ns, position)
+        seen = Approached(target) if approached else None
+        fault = check.update(seen, (target,), stamp_ns, position, used=used)
         if fault:
             return fault, north_m
     return "", north_m
@@ -89,15 +95,45 @@ def test_a_distance_that_does_not_fall_is_a_fault(speed_mps: float, sigma_m: flo
     assert LEAST_FLOWN_M < flown_m < max(LEAST_FLOWN_M, 2.0 * sigma_m) + 1.5 * speed_mps + 0.1
 
 
-def test_boxes_that_never_change_are_a_fault_for_any_behaviour() -> None:
-    fault, flown_m = flown(speed_mps=2.0, away_mps=2.0, box_px=0.0, approached=False)
+def frozen_boxes(*, speed_mps: float = 2.0, cut: bool = False, **options: bool) -> tuple[str, float]:
+    """The fault of a flight whose boxes move in the image for a second, and then stay."""
+    options = {"approached": False, "cut": cut, **options}
+    return flown(speed_mps=speed_mps, away_mps=speed_mps, box_px=3.0, freezes_s=1.0, **options)
+
+
+def test_boxes_that_stop_changing_are_a_fault_for_any_behaviour() -> None:
+    fault, flown_m = frozen_boxes()
     assert "pixels" in fault
-    assert flown_m == pytest.approx(LEAST_FLOWN_M, abs=0.3)
+    assert flown_m == pytest.approx(2.0 + LEAST_FLOWN_M, abs=0.3)
 
 
-@pytest.mark.parametrize("case", [{"speed_mps": 0.0}, {"speed_mps": 2.0, "cut": True}])
-def test_a_box_may_stay_where_nothing_moves_or_it_fills_the_image(case: dict[str, float]) -> None:
-    assert flown(**case, away_mps=case["speed_mps"], box_px=0.0, approached=False)[0] == ""  # type: ignore[arg-type]
+@pytest.mark.parametrize("case", [{"speed_mps": 0.0}, {"cut": True}, {"rounded": True}, {"used": False}])
+def test_boxes_may_stay_where_that_shows_nothing(case: dict[str, float]) -> None:
+    assert frozen_boxes(**case)[0] == ""  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("tracks", [True, False])
+@pytest.mark.parametrize("beside_s", [0.0, 2.0])
+def test_a_part_of_the_vehicle_stays_at_its_pixels(beside_s: float, tracks: bool) -> None:
+    check, rng = ClosingCheck(), np.random.default_rng(5)
+    for number in range(150):
+        stamp_ns = 10**9 + number * PERIOD_NS
+        gear = seen_at(stamp_ns, 10.0, track_id=1 if tracks else None)
+        other = seen_at(stamp_ns, 10.0, box_px=100.0 + rng.normal(0.0, 2.0), track_id=2 if tracks else None)
+        seen = (other, gear) if number * PERIOD_NS / 1e9 < beside_s else (gear,)
+        assert not check.update(None, seen, stamp_ns, (0.3 * number, 0.0, -HEIGHT_M))
+
+
+def test_a_camera_that_froze_before_the_command_is_found() -> None:
+    check, rng, offset_px = ClosingCheck(), np.random.default_rng(5), 0.0
+    for number in range(60):
+        stamp_ns = 10**9 + number * PERIOD_NS
+        offset_px = rng.normal(0.0, 2.0) if number < 15 else offset_px
+        seen = seen_at(stamp_ns, 10.0, box_px=offset_px)
+        check.update(None, (seen,), stamp_ns, (0.1 * max(0, number - 30), 0.0, -HEIGHT_M), used=number > 30)
+        if number == 30:
+            check.reset()
+    assert "pixels" in check.fault
 
 
 def test_a_followed_object_may_keep_its_distance() -> None:
