@@ -293,7 +293,7 @@ LOW_M = 1.5  # flown by setpoints from the ground
 
 
 def on_ground() -> GuidanceHarness:
-    """A PX4 that reports to be on the ground for ever."""
+    """A PX4 that reports to be on the ground forever."""
 
     def grounded(inputs: GuidanceInput) -> GuidanceInput:
         return replace(inputs, state=replace(inputs.state, landed=LandedState.ON_GROUND, autopilot="PX4"))

@@ -222,13 +222,13 @@ def test_commands_that_end_a_flight_are_not_refused(
     assert not harness.command(behaviour()).done()
 
 
-class SilentUntilHeard:
-    """The state as `TelemetryState.discard_received` leaves it, until `heard`."""
+class SilentUntilReceived:
+    """The state as `TelemetryState.discard_received` leaves it, until `received`."""
 
-    heard = False
+    received = False
 
     def __call__(self, inputs: GuidanceInput) -> GuidanceInput:
-        state = inputs.state if self.heard else replace(inputs.state, heartbeat_ns=0, position_ns=0)
+        state = inputs.state if self.received else replace(inputs.state, heartbeat_ns=0, position_ns=0)
         return replace(with_leader(inputs), state=state)
 
 
@@ -239,7 +239,7 @@ def test_commands_that_end_a_flight_wait_for_a_heartbeat(
 ) -> None:
     harness = _flown("goto 60 0")()
     harness.stand_still(4.0, suspended=True)
-    harness._inputs = silent = SilentUntilHeard()
+    harness._inputs = silent = SilentUntilReceived()
     pending = harness.command(behaviour())
     harness.run(0.9)
     assert not pending.done()
@@ -247,7 +247,7 @@ def test_commands_that_end_a_flight_wait_for_a_heartbeat(
     harness.autopilot.change_mode(mode)
     harness.run(0.4)
     assert not pending.done()
-    silent.heard = True
+    silent.received = True
     assert harness.outcome(pending).success
     assert harness.autopilot.requests[-1] == {"land": "land", "rtl": "return", "stop": "hold"}[behaviour.name]
 
@@ -256,7 +256,7 @@ def test_commands_that_end_a_flight_wait_for_a_heartbeat(
 def test_command_without_a_heartbeat_is_answered(newer: type[HoldBehaviour] | type[StopBehaviour]) -> None:
     harness = _flown("goto 60 0")()
     harness.stand_still(1.0, suspended=True)
-    harness._inputs = SilentUntilHeard()
+    harness._inputs = SilentUntilReceived()
     pending = harness.command(StopBehaviour())
     second = harness.command(newer())
     assert "superseded" in pending.result().reason
