@@ -7,9 +7,11 @@ ssh without a terminal, which sends no signal. A second signal changes nothing: 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import select
 import signal
+import stat
 from collections.abc import Callable, Coroutine
 from typing import TypeVar
 
@@ -64,11 +66,9 @@ async def until_ended(work: Coroutine[object, object, _T]) -> _T:
 
 
 async def _watch_readers(end: Callable[[], object]) -> None:
-    """Call `end` once the reader of an output has gone. Not for systemd's journal, which may restart."""
-    if "JOURNAL_STREAM" in os.environ:
-        return
+    """Call `end` once the reader of an output has gone."""
     watched = select.poll()
-    for descriptor in _OUTPUTS:
+    for descriptor in _with_readers():
         watched.register(descriptor, 0)
     gone = select.POLLERR | select.POLLHUP
     while True:
@@ -76,3 +76,18 @@ async def _watch_readers(end: Callable[[], object]) -> None:
         if any(event & gone for _, event in watched.poll(0)):
             end()
             return
+
+
+def _with_readers() -> list[int]:
+    """The outputs to watch: not the sockets of systemd's journal, which may restart.
+
+    JOURNAL_STREAM is device and inode of one of them. What a unit starts inherits it, such as a terminal of
+    the desktop and all of its programs, whose outputs are others.
+    """
+    found = dict[int, os.stat_result]()
+    for descriptor in _OUTPUTS:
+        with contextlib.suppress(OSError):  # closed
+            found[descriptor] = os.fstat(descriptor)
+    journal = os.environ.get("JOURNAL_STREAM")
+    to_journal = any(f"{each.st_dev}:{each.st_ino}" == journal for each in found.values())
+    return [number for number, each in found.items() if not (to_journal and stat.S_ISSOCK(each.st_mode))]

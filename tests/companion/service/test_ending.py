@@ -6,6 +6,7 @@ import asyncio
 import os
 import pty
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -116,3 +117,25 @@ def test_work_ends_in_order_by_each_way(way: str, tmp_path: Path) -> None:
                 running.send_signal(signal.Signals[way])
         assert running.wait(20) == 7
     assert ended.exists()
+
+
+@pytest.mark.parametrize("journal", ["output", "terminal"])
+def test_reader_counts_unless_it_is_the_journal(journal: str, tmp_path: Path) -> None:
+    """A terminal of the desktop, a unit itself, passes its own JOURNAL_STREAM on."""
+    ours, outputs = socket.socketpair()
+    stream = os.fstat(outputs.fileno())
+    name = f"{stream.st_dev}:{stream.st_ino}" if journal == "output" else "8:1"
+    program = [sys.executable, "-c", PROGRAM, str(tmp_path / "ended")]
+    environment = {**os.environ, "JOURNAL_STREAM": name}
+    with subprocess.Popen(program, stdout=outputs, env=environment) as running:
+        outputs.close()
+        assert ours.recv(100) == b"working\n"
+        ours.close()
+        try:
+            if journal == "output":
+                with pytest.raises(subprocess.TimeoutExpired):
+                    running.wait(2.0)  # four looks at the readers
+                running.terminate()
+            assert running.wait(20) == 7
+        finally:
+            running.kill()
