@@ -17,11 +17,13 @@ pilot who has changed the mode in between. The rules:
    before is requested again, once, by the same rules. Without that acknowledgement the wanted mode is the
    pilot's own choice, and stays. A failsafe of the autopilot is not restored, and nothing is armed again.
 
-PX4 sends one acknowledgement, since 1.16 two to DO_SET_MODE (the first always accepts); both leave before
-the report of the mode. What is not restored: a pilot's change that our message overrides before it has been
-reported, which is known to nobody, and one whose report or our acknowledgement is lost. CURRENT_MODE (PX4
-since 1.15) reports a change at once, but no second one within 0.1 s; HEARTBEAT alone reports it within 1 s on
-PX4 1.14, and within 0.2 s on ArduPilot.
+PX4 sends one acknowledgement, since 1.16 two to DO_SET_MODE (the first always accepts); both leave before the
+report of the mode. What is not restored: a pilot's change that our message overrides before it has been
+reported, which is known to nobody, and one whose report or our acknowledgement is lost. Where our
+acknowledgement comes twice and a pilot changes away and back to our mode within `IN_FLIGHT_S`, that cannot be
+told from a request that came twice: his first mode is requested again. CURRENT_MODE (PX4 since 1.15) reports
+a change at once, but no second one within 0.1 s; HEARTBEAT alone reports it within 1 s on PX4 1.14, and
+within 0.2 s on ArduPilot.
 """
 
 from __future__ import annotations
@@ -298,8 +300,10 @@ def _by_itself(change: ModeChange, state: VehicleState) -> bool:
 
 
 def _taken_over(change: ModeChange, state: VehicleState) -> str:
-    shown = f"{state.mode.value.replace('_', ' ')} mode"
+    shown, by_itself = f"{state.mode.value.replace('_', ' ')} mode", _by_itself(change, state)
     if state.armed is not change.before.armed and state.custom_mode == change.before.custom_mode:
         shown = "armed" if state.armed else "disarmed"
-    who = "autopilot failsafe" if _by_itself(change, state) else "the pilot took over"
+        if not state.armed and not by_itself:  # a pilot, or PX4 on the ground after COM_DISARM_PRFLT
+            return f"the vehicle was disarmed, while {change.what} was requested"
+    who = "autopilot failsafe" if by_itself else "the pilot took over"
     return f"{who}: {shown}, while {change.what} was requested"

@@ -141,6 +141,14 @@ def test_any_other_report_ends_the_request(sender: Sender, other: VehicleState) 
     assert len(sender.sent) == 1
 
 
+def test_disarming_is_not_called_a_pilots(sender: Sender) -> None:
+    """PX4 disarms by itself on the ground."""
+    change = sender.begin(HOLD, OFFBOARD)
+    sender.report(replace(HOLD, armed=False))
+    assert "disarmed" in change.why
+    assert "pilot" not in change.why
+
+
 def test_nothing_is_sent_if_the_mode_has_changed_since(sender: Sender) -> None:
     change = sender.begin(OFFBOARD, HOLD, POSITION)
     assert (change.ending, sender.sent) == (Ending.TAKEN_OVER, [])
