@@ -1,7 +1,8 @@
 """Queue of commands: one that needs a gimbal, home or detections waits for the first report of it.
 
 The gimbal manager is asked; PX4 sends home every two seconds; a camera that has just started sends its first
-detections within seconds. After a standstill `stop`, `land` and `rtl` wait for the next heartbeat.
+detections within seconds. After a standstill `stop`, `land` and `rtl` wait for the next heartbeat,
+and where it matters for the VTOL state.
 
 A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
 battery, or the end of the service. The mode in the first heartbeat after a standstill supersedes nothing.
@@ -17,8 +18,9 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.gimbal.controller import ENDING, FIND_TIMEOUT_S, GimbalController, is_known
 from companion.guidance.interface import CommandInput, OutputCollector
 from companion.vehicle.state import VehicleState
+from companion.vehicle.vehicle_type import NOT_KNOWN_YET
 
-_GIMBAL, _HEARTBEAT = "the gimbal", "the autopilot's next heartbeat"
+_GIMBAL, _AUTOPILOT = "the gimbal", "the autopilot's next reports"
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +74,8 @@ class CommandQueue:
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
         """Supersede waiting commands after a change of mode or arming."""
         if self._mode_changes is not None and mode_changes != self._mode_changes:
-            unknown = [waiting for waiting in self._waiting if waiting.awaited == _HEARTBEAT]
-            self._waiting = [waiting for waiting in self._waiting if waiting.awaited != _HEARTBEAT]
+            unknown = [waiting for waiting in self._waiting if waiting.awaited == _AUTOPILOT]
+            self._waiting = [waiting for waiting in self._waiting if waiting.awaited != _AUTOPILOT]
             self.supersede(_change(state), out)
             self._waiting += unknown
         self._mode_changes = mode_changes
@@ -118,8 +120,9 @@ class CommandQueue:
 def _awaited(command: CommandInput, context: BehaviourContext) -> str:
     """What the command waits for, in words; empty: nothing."""
     behaviour = command.behaviour
-    if ends_flight(behaviour) and not context.state.heartbeat_ns:
-        return _HEARTBEAT
+    state = context.state
+    if ends_flight(behaviour) and (not state.heartbeat_ns or state.not_flown in NOT_KNOWN_YET):
+        return _AUTOPILOT
     needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.requirements)
     for later in () if behaviour is None else behaviour.later:
         needed |= later.requirements

@@ -21,6 +21,7 @@ from companion.guidance.interface import CommandInput, EventKind, GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.vehicle_type import VtolState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, engaged, flying, parked
 
 LEADER = Neighbour("alpha", (20.0, 0.0, -5.0), (0.0, 0.0, 0.0), 0.0, 0.0, age_s=0.1)
@@ -250,6 +251,20 @@ def test_commands_that_end_a_flight_wait_for_a_heartbeat(
     silent.received = True
     assert harness.outcome(pending).success
     assert harness.autopilot.requests[-1] == {"land": "land", "rtl": "return", "stop": "hold"}[behaviour.name]
+
+
+def test_commands_that_end_a_flight_wait_for_the_vtol_state() -> None:
+    harness = _flown("goto 60 0")()
+    harness.stand_still(4.0, suspended=True)
+    vtol_states: list[VtolState | None] = [None]
+    harness._inputs = lambda inputs: replace(
+        inputs, state=replace(inputs.state, mav_type=22, mav_autopilot=12, vtol_state=vtol_states[-1])
+    )
+    pending = harness.command(StopBehaviour())
+    harness.run(0.9)
+    assert not pending.done()
+    vtol_states.append(VtolState.MC)
+    assert harness.outcome(pending).success
 
 
 @pytest.mark.parametrize("newer", [HoldBehaviour, StopBehaviour])
