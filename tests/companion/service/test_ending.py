@@ -127,7 +127,7 @@ def test_reader_counts_unless_it_is_the_journal(journal: str, tmp_path: Path) ->
     name = f"{stream.st_dev}:{stream.st_ino}" if journal == "output" else "8:1"
     program = [sys.executable, "-c", PROGRAM, str(tmp_path / "ended")]
     environment = {**os.environ, "JOURNAL_STREAM": name}
-    with subprocess.Popen(program, stdout=outputs, env=environment) as running:
+    with subprocess.Popen(program, stdout=outputs.fileno(), env=environment) as running:
         outputs.close()
         assert ours.recv(100) == b"working\n"
         ours.close()
