@@ -20,7 +20,7 @@ pilot who has changed the mode in between. The rules:
 PX4 sends one acknowledgement, since 1.16 two to DO_SET_MODE (the first always accepts); both leave before the
 report of the mode. What is not restored: a pilot's change that our message overrides before it has been
 reported, which is known to nobody, and one whose report or our acknowledgement is lost. Where our
-acknowledgement comes twice and a pilot changes away and back to our mode within `IN_FLIGHT_S`, that looks like
+acknowledgement comes twice and a pilot changes away and back to our mode within `IN_FLIGHT_S`, it looks like
 a request that came twice: his first mode is requested again. CURRENT_MODE (PX4 since 1.15) reports a change
 at once, but no second one within 0.1 s; HEARTBEAT alone reports it within 1 s on PX4 1.14, and within 0.2 s
 on ArduPilot.
