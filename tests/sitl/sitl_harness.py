@@ -484,7 +484,10 @@ def bring_down(link: AutopilotLink) -> None:
     if not link.grounded:
         link.set_mode(LAND[link.autopilot or 0])
         link.until(lambda: link.grounded, GROUNDED_S, "landed and disarmed")
-    link.set_mode(PARKED[link.autopilot or 0])
+    parked = PARKED[link.autopilot or 0]
+    link.set_mode(parked)
+    # Else it is a pilot's change during the next command.
+    link.until(lambda: link.modes[-1][1] == parked, _ANSWER_S, "in the mode that it can be armed in")
 
 
 @contextlib.contextmanager
