@@ -37,7 +37,7 @@ class VelocitySenders:
         """Process a message. Its lifetime counts from when it was sent, as far as its delay is known.
 
         Raises:
-            PeerDataError: the message is not valid, is overtaken by a newer one, or has arrived expired.
+            PeerDataError: the message is not valid, is superseded by a newer one, or has arrived expired.
         """
         if receipt_ns < self._valid_from_ns:
             return
