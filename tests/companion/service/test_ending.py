@@ -128,10 +128,10 @@ def test_reader_counts_unless_it_is_the_journal(journal: str, tmp_path: Path) ->
     program = [sys.executable, "-c", PROGRAM, str(tmp_path / "ended")]
     environment = {**os.environ, "JOURNAL_STREAM": name}
     with subprocess.Popen(program, stdout=outputs.fileno(), env=environment) as running:
-        outputs.close()
-        assert ours.recv(100) == b"working\n"
-        ours.close()
         try:
+            outputs.close()
+            with ours, ours.makefile("rb") as reader:
+                assert reader.readline() == b"working\n"
             if journal == "output":
                 with pytest.raises(subprocess.TimeoutExpired):
                     running.wait(2.0)  # four looks at the readers
