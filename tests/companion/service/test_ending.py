@@ -47,6 +47,7 @@ except EndedError:
 def default_signals() -> Iterator[None]:
     """Programs inherit what is ignored: under nohup, SIGHUP would be."""
     before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGHUP, signal.SIGTERM)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)  # of "&" in a shell
     yield
     for number, handler in before.items():
         signal.signal(number, handler)
