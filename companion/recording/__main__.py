@@ -38,7 +38,7 @@ def main(argument: str) -> int:
         else:
             from companion.recording.recorder import RecorderOptions, record
 
-            record(RecorderOptions(zenoh=zenoh, **values), ending, _say)
+            record(RecorderOptions(zenoh=zenoh, **values), ending, _say, patient=True)
     except ModuleNotFoundError as error:
         _say(f"{error}: pip install 'mavlink-companion[{extra}]'")
         return EXIT_REFUSED

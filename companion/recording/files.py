@@ -6,6 +6,7 @@ import contextlib
 import itertools
 import os
 import re
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ PROFILE = "companion"
 CHUNK_BYTES = 1 << 20
 # A chunk is written at least this often: what a crash or a cut loses.
 FLUSH_S = 1.0
+# The rest of the computer needs space too: its logs, and a shell to remove files.
+KEPT_FREE_BYTES = 200_000_000
 PRIVATE, PRIVATE_FOLDER = 0o600, 0o700
 """Modes of what is made: images and positions are for its owner."""
 _HEADER_BYTES = 9  # opcode and length of a record
@@ -68,7 +71,8 @@ class RecordingWriter:
 
     Raises:
         RecordingError: the folder or a file cannot be written, here and from `write` and `flush`. The file is
-            then cut after its last whole chunk.
+            then cut after its last whole chunk. Fewer than `KEPT_FREE_BYTES` are free, here and from `flush`:
+            the file is then complete.
     """
 
     def __init__(
@@ -84,6 +88,7 @@ class RecordingWriter:
             directory.mkdir(PRIVATE_FOLDER, parents=True, exist_ok=True)
         except OSError as error:
             raise RecordingError(f"{directory}: the folder cannot be made: {error.strerror}") from error
+        self._check_space()
         self._open()
 
     def write(self, channel: Channel, log_time_ns: int, data: bytes) -> None:
@@ -99,6 +104,11 @@ class RecordingWriter:
         if self._file.size >= self._max_bytes or time.monotonic() - self._began_s >= self._max_duration_s:
             self.begin_next()
         self._remove_old()
+        try:
+            self._check_space()
+        except RecordingError:
+            self.close()
+            raise
 
     def begin_next(self) -> None:
         """End the file and begin the next one."""
@@ -131,6 +141,11 @@ class RecordingWriter:
         with self._cut_on_failure():
             self._messages = _Messages(self._file)
 
+    def _check_space(self) -> None:
+        if free_bytes(self._directory) < KEPT_FREE_BYTES:
+            kept_mb = KEPT_FREE_BYTES // 1_000_000
+            raise RecordingError(f"{self._directory}: the disk is full: fewer than {kept_mb} MB are free")
+
     @contextlib.contextmanager
     def _cut_on_failure(self) -> Iterator[None]:
         whole = self._file.size
@@ -154,6 +169,14 @@ class RecordingWriter:
             total -= files[path].st_size
             with contextlib.suppress(OSError):  # another recorder may have removed it
                 path.unlink()
+
+
+def free_bytes(directory: Path) -> int:
+    """Return what an ordinary user may still write there. Raises RecordingError."""
+    try:
+        return shutil.disk_usage(directory).free
+    except OSError as error:
+        raise RecordingError(f"{directory}: cannot be read: {error.strerror}") from error
 
 
 class _Messages:

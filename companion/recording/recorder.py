@@ -6,6 +6,7 @@ import json
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event
@@ -16,6 +17,7 @@ from typing_extensions import TypedDict
 
 from companion.bus.client import open_client, subscribe_kept
 from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
+from companion.recording import RecordingError
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.scheduling import lower_priority
@@ -27,6 +29,10 @@ MAX_WAITING = 10_000
 _POLL_S = 0.05
 # The last messages of a service that ends may still arrive.
 _LAST_S = 0.3
+# A disk with space again, or a folder that has come, is used within this time.
+RETRY_S = 10.0
+# Beginnings of what it says.
+RECORDING, RECORDED, PAUSED = "recording to ", "recorded ", "paused: "
 
 
 class LossesBody(TypedDict):
@@ -178,43 +184,64 @@ def subscribe_all(
     return subscribers
 
 
-def record(options: RecorderOptions, ending: Event, say: Callable[[str], None]) -> None:
-    """Record until `ending` is set.
+def record(
+    options: RecorderOptions, ending: Event, say: Callable[[str], None], *, patient: bool = False
+) -> None:
+    """Record until `ending` is set. While nothing can be written it pauses; then it begins a new file.
 
     Args:
-        say: called with the first file's path, and at the end with the last one's.
+        say: called with each file's path at its begin and at its end, and with why it pauses.
+        patient: it also waits for the first file.
 
     Raises:
-        RecordingError: the recording cannot be written (any more). NoAnswerError: no service at the endpoint.
+        RecordingError: the first file cannot be written. NoAnswerError: no service at the endpoint.
     """
     lower_priority(_NICER)
-    prefix = f"{ROOT}/{options.vehicle}/"
+    said: str | None = None
     with open_client(options.zenoh, timeout_s=10.0) as session:
-        recorder = Recorder(options)
+        while not ending.is_set():
+            try:
+                recorder = Recorder(options)
+                said, patient = None, True
+                _write_until(ending, recorder, session, options, say)
+            except RecordingError as error:
+                if not patient:
+                    raise
+                if str(error) != said:
+                    say(f"{PAUSED}{error}; tried again every {RETRY_S:g} s")
+                said = str(error)
+                ending.wait(RETRY_S)
 
-        def receive(sample: zenoh.Sample) -> None:
-            attachment = sample.attachment
-            recorder.add(
-                str(sample.key_expr).removeprefix(prefix),
-                sample.payload.to_bytes(),
-                None if attachment is None else attachment.to_bytes(),
-            )
 
-        subscribers = subscribe_all(session, options.vehicle, topics_of(options), receive)
-        encoding = None
-        if options.frames:
-            from companion.recording.lossless import FrameEncoder  # OpenCV is not loaded without
+def _write_until(
+    ending: Event,
+    recorder: Recorder,
+    session: zenoh.Session,
+    options: RecorderOptions,
+    say: Callable[[str], None],
+) -> None:
+    """Write what arrives until `ending` is set. Raises RecordingError."""
+    prefix = f"{ROOT}/{options.vehicle}/"
 
-            encoding = FrameEncoder(options.frames, recorder)
-        say(f"recording to {recorder.path}")
-        try:
+    def receive(sample: zenoh.Sample) -> None:
+        attachment = sample.attachment
+        recorder.add(
+            str(sample.key_expr).removeprefix(prefix),
+            sample.payload.to_bytes(),
+            None if attachment is None else attachment.to_bytes(),
+        )
+
+    with ExitStack() as stack:
+        for subscriber in subscribe_all(session, options.vehicle, topics_of(options), receive):
+            stack.callback(subscriber.undeclare)
+        with ExitStack() as encoding:
+            if options.frames:
+                from companion.recording.lossless import FrameEncoder  # OpenCV is not loaded without
+
+                encoding.callback(FrameEncoder(options.frames, recorder).close)
+            say(f"{RECORDING}{recorder.path}")
             while not ending.wait(_POLL_S):
                 recorder.write()
-        finally:
-            if encoding is not None:
-                encoding.close()
         time.sleep(_LAST_S)
-        for subscriber in subscribers:
-            subscriber.undeclare()
     recorder.close()
-    say(f"recorded {recorder.path}")
+    say(f"{RECORDED}{recorder.path}")

@@ -138,7 +138,7 @@ def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path
     assert names["HEARTBEAT"]
 
 
-def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], tmp_path: Path) -> None:
+def test_recorder_is_started_again_and_pauses_on_a_full_disk(filming: list[str], tmp_path: Path) -> None:
     """The limit of a file's size stands for a full disk: the same write fails, with EFBIG for ENOSPC."""
     folder = tmp_path / "recordings"
     with (
@@ -164,10 +164,13 @@ def test_recorder_is_started_again_but_not_for_a_full_disk(filming: list[str], t
         line = service.wait_for_line("cannot be written")
         assert str(files(folder)[1]) in line
         assert service.command("hold")["success"]
+        resource.prlimit(recorder, resource.RLIMIT_FSIZE, (hard, hard))
+        wait_for(lambda: len(files(folder)) == 3 and messages_of(files(folder)[2])["guidance_input"] > 20)
+        assert recorder_of(service) == recorder
         assert service.stop() == 0
-    assert [each for each in service.last_lines() if "recorder" in each].count(line) == 1
+    assert service.lines.count(line) == 1
     assert len([each for each in service.lines if "started again" in each]) == 1
-    before, after = map(steps_of, files(folder))
+    before, after = map(steps_of, files(folder)[:2])
     # Only the last chunk, of a second, is missing: the steps wait for the new recorder.
     assert after[0]["now_ns"] - before[-1]["now_ns"] < 2e9
     assert [each["step"] for each in after] == list(range(after[0]["step"], after[-1]["step"] + 1))
