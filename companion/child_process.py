@@ -10,17 +10,17 @@ import asyncio
 import os
 import sys
 import threading
+import time
 from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
+from companion.restarts import Restarts
 from companion.scheduling import schedule_as_any_program
 from companion.tasks import spawn
 
 # Exit code of a program that has printed in one line why it cannot work: it is not started again.
 EXIT_REFUSED = 2
-MAX_RESTARTS = 5
-_RESTART_S = 1.0  # longer by this each time; the first time at once
 _END_S = 5.0
 _UNSAID_S = 2.0  # a longer end is announced
 
@@ -31,7 +31,7 @@ Say = Callable[[str], None]
 async def child_process(
     name: str, module: str, argument: str, say: Say, *, end_s: float = _END_S
 ) -> AsyncIterator[None]:
-    """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash.
+    """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash (`Restarts`).
 
     Args:
         name: for people. say: called in the loop with each line that it prints, and with its end.
@@ -46,40 +46,43 @@ async def child_process(
 
 
 async def _supervise(name: str, words: tuple[str, str], say: Say, end_s: float) -> None:
-    try:
-        await _run_again(name, words, say, end_s)
-    except (OSError, ValueError) as error:  # no process, or a line above 64 KiB
-        say(f"{name}: not started again: {error}")
-
-
-async def _run_again(name: str, words: tuple[str, str], say: Say, end_s: float) -> None:
-    for restarts in range(MAX_RESTARTS + 1):
-        process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-P",  # import from the search path below, not from the working directory
-            "-m",
-            *words,
-            stdin=PIPE,
-            stdout=PIPE,
-            stderr=STDOUT,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            # Ctrl-C in the terminal is for the parent, which then closes the pipe.
-            process_group=0,
-        )
-        schedule_as_any_program(process.pid)
+    restarts = Restarts()
+    while True:
+        started_s = time.monotonic()
         try:
-            assert process.stdout is not None
-            while line := await process.stdout.readline():
-                say(f"{name}: {line.decode(errors='replace').rstrip()}")
-            code = await process.wait()
-        finally:
-            await _end(process, end_s, lambda text: say(f"{name}: {text}"))
-        if code == EXIT_REFUSED:
-            return
-        if restarts < MAX_RESTARTS:
-            say(f"{name}: its process ended with code {code}; it is started again")
-            await asyncio.sleep(_RESTART_S * restarts)
-    say(f"{name}: ended {MAX_RESTARTS + 1} times; not started again")
+            code = await _run_once(name, words, say, end_s)
+        except (OSError, ValueError) as error:  # no process, or a line above 64 KiB
+            why = str(error)
+        else:
+            if code == EXIT_REFUSED:
+                return
+            why = f"its process ended with code {code}"
+        restart = restarts.after(time.monotonic() - started_s)
+        say(f"{name}: {why}; {restart}")
+        await asyncio.sleep(restart.pause_s)
+
+
+async def _run_once(name: str, words: tuple[str, str], say: Say, end_s: float) -> int:
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-P",  # import from the search path below, not from the working directory
+        "-m",
+        *words,
+        stdin=PIPE,
+        stdout=PIPE,
+        stderr=STDOUT,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        # Ctrl-C in the terminal is for the parent, which then closes the pipe.
+        process_group=0,
+    )
+    schedule_as_any_program(process.pid)
+    try:
+        assert process.stdout is not None
+        while line := await process.stdout.readline():
+            say(f"{name}: {line.decode(errors='replace').rstrip()}")
+        return await process.wait()
+    finally:
+        await _end(process, end_s, lambda text: say(f"{name}: {text}"))
 
 
 async def _end(process: Process, end_s: float, say: Say) -> None:

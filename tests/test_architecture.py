@@ -18,6 +18,7 @@ COMPANION_LAYERS = {
     "geometry": 0,
     "peer_data": 0,
     "plugins": 0,
+    "restarts": 0,
     "scheduling": 0,
     "tasks": 0,
     "toml_text": 0,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion import child_process
+from companion import child_process, restarts
 
 pytestmark = pytest.mark.realtime
 
@@ -53,3 +53,40 @@ def test_program_that_does_not_end_is_killed_and_named(
     assert warned.endswith(" 0.1 s")
     assert killed.startswith("program: did ")
     assert killed.endswith("within 0.2 s; killed")
+
+
+DYING = """
+import pathlib, sys
+count = pathlib.Path({path!r})
+number = int(count.read_text()) + 1 if count.exists() else 1
+count.write_text(str(number))
+if number <= 7:
+    sys.exit(3)
+print("ready", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_program_is_started_again_without_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(restarts, "SOON_S", (0.01,) * 5)
+    monkeypatch.setattr(restarts, "LATER_S", 0.02)
+    (tmp_path / "dying_program.py").write_text(DYING.format(path=str(tmp_path / "count")))
+    said: list[str] = []
+
+    async def until_ready() -> None:
+        ready = asyncio.Event()
+
+        def say(line: str) -> None:
+            said.append(line)
+            if line == "program: ready":
+                ready.set()
+
+        async with child_process.child_process("program", "dying_program", "{}", say):
+            await ready.wait()
+
+    asyncio.run(until_ready())
+    assert [line.split("; ")[1] for line in said[:-1]] == [
+        *(f"restarting ({count} of 5)" for count in range(1, 6)),
+        *(f"tried again every 0.02 s, {count} failures so far" for count in (6, 7)),
+    ]

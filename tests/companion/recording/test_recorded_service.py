@@ -152,7 +152,7 @@ def test_recorder_is_started_again_and_pauses_on_a_full_disk(filming: list[str],
         # On a busy machine the recorder is late: kill it when it is not.
         wait_for(lambda: time.monotonic_ns() - steps_of(files(folder)[0])[-1]["now_ns"] < 1.5e9)
         os.kill(recorder, signal.SIGKILL)
-        service.wait_for_line("started again")
+        service.wait_for_line("restarting (")
         (first,) = files(folder)
         assert messages_of(first)["guidance_input"] > 20
         assert library_times(first) == [message.log_time_ns for message in RecordingReader(first).messages()]
@@ -169,7 +169,7 @@ def test_recorder_is_started_again_and_pauses_on_a_full_disk(filming: list[str],
         assert recorder_of(service) == recorder
         assert service.stop() == 0
     assert service.lines.count(line) == 1
-    assert len([each for each in service.lines if "started again" in each]) == 1
+    assert len([each for each in service.lines if "restarting (" in each]) == 1
     before, after = map(steps_of, files(folder)[:2])
     # Only the last chunk, of a second, is missing: the steps wait for the new recorder.
     assert after[0]["now_ns"] - before[-1]["now_ns"] < 2e9
