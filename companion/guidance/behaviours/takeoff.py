@@ -18,7 +18,7 @@ from companion.guidance.behaviour import (
     Requirement,
 )
 from companion.guidance.command import BuildContext, Command, Number, behaviour
-from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, PositionController
+from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, POSITION_GAIN, PositionController, towards
 from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
@@ -34,6 +34,9 @@ THERE_S = 0.5
 BASE_TIMEOUT_S = 25.0
 SLOWEST_CLIMB_MPS = 0.5
 CLIMB_MPS = 1.0
+# Horizontal correction in a climb by setpoint. The estimate may move by a metre as a vehicle lifts off: a
+# position hold commanded 2 m/s, of which PX4 v1.18.0-beta1 flew 0.6 m/s, and the take-off ended.
+SIDEWAYS_MPS = 0.5
 # PX4's own take-off is used from this far above its acceptance radius: its height may drift by 0.5 m, and it
 # still climbs more than 1 m.
 LOW_MARGIN_M = 1.5
@@ -120,9 +123,11 @@ class TakeoffBehaviour(Behaviour):
                     return ModeRequest(FlightMode.HOLD, arm=True)
                 return ModeRequest(FlightMode.TAKEOFF, self._altitude_m, arm=True)
             self._yaw_rad = state.yaw_rad
-        self._top = self._above(state, missing_m, self._top)
-        velocity = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
-        return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+        standing = state.landed is LandedState.ON_GROUND  # what moves then is the estimate
+        self._top = self._above(state, missing_m, None if standing else self._top)
+        *_, down_mps = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
+        sideways_mps = towards(self._top, state.position_ned_m or self._top, POSITION_GAIN, SIDEWAYS_MPS)
+        return Setpoint.velocity((*sideways_mps, down_mps), now_ns, yaw_rad=self._yaw_rad)
 
     @staticmethod
     def _above(state: VehicleState, missing_m: float, top: Vector3 | None) -> Vector3:

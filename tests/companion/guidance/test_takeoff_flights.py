@@ -10,6 +10,7 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.guidance.behaviour import Outcome
+from companion.guidance.behaviours.takeoff import SIDEWAYS_MPS
 from companion.vehicle.autopilot_profile import Px4Profile
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -153,6 +154,25 @@ def test_twenty_low_takeoffs_reach_their_height(px4: str) -> None:
         assert outcome.success, (number, wanted_m, drift_m, outcome.reason)
         assert flight.state.altitude_m == pytest.approx(wanted_m, abs=0.3)
         assert FlightMode.TAKEOFF not in modes
+
+
+@pytest.mark.parametrize("after_s", [0.5, 1.0, 1.5, 2.0, 2.5])
+def test_estimate_that_moves_at_lift_off_is_not_chased(after_s: float) -> None:
+    """It drifts by a metre, without a counted reset, before the vehicle lifts off (1.9 s) or after."""
+    flight = on_ground()
+    at_s = flight.vehicle.vehicle.faults.now_s + after_s
+    flight.vehicle.vehicle.faults.begin(f"gps_drift speed=0.6 limit=1 towards=60 at={at_s}")
+    log = flight.fly("takeoff 1.5", 40.0, warm_up_s=0.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    standing = 0
+    for moment in log.moments:
+        velocity = moment.sent.velocity_ned_mps
+        assert velocity is not None
+        on_ground_now = moment.context.state.landed is LandedState.ON_GROUND
+        standing += on_ground_now
+        assert math.hypot(*velocity[:2]) <= (0.0 if on_ground_now else SIDEWAYS_MPS + 1e-6)
+    assert standing > 10
 
 
 @pytest.mark.parametrize(("acceptance_m", "wanted_m"), [(0.8, 2.0), (200.0, 5.0), (None, 1.5)])
