@@ -151,12 +151,13 @@ def test_a_lost_link_ends_the_command_and_is_not_resumed(flight: Flight) -> None
     )
 
 
-def assert_arming_is_refused(flight: Flight, reason: str) -> None:
+def assert_arming_is_refused(flight: Flight, *reasons: str) -> None:
+    """For one of these reasons: an autopilot's words change with its version."""
     link = flight.link
     link.until(lambda: not link.ready, 10.0, "not ready to be armed")
     reply = flight.command("takeoff 3")
     assert not reply["success"]
-    assert reason.lower() in reply["reason"].lower()
+    assert any(reason.lower() in reply["reason"].lower() for reason in reasons), reply
     assert not link.armed
 
 
@@ -177,19 +178,27 @@ def test_refused_arming_has_the_autopilots_own_reason(
 
 
 @pytest.mark.parametrize(
-    ("cause", "cure", "reason"),
+    ("cause", "cure", "reasons"),
     [
-        ("sensor_mag_sim stop", "sensor_mag_sim start", "Found 0 compass (required: 1)"),
-        ("param set COM_ARMABLE 0", "param set COM_ARMABLE 1", "Vehicle is in safety configuration"),
+        (
+            "sensor_mag_sim stop",
+            "sensor_mag_sim start",
+            ("Found 0 compass (required: 1)", "Compass sensor 0 missing"),
+        ),
+        ("param set COM_ARMABLE 0", "param set COM_ARMABLE 1", ("Vehicle is in safety configuration",)),
     ],
 )
-def test_a_failing_check_of_px4_is_the_reason(flight: Flight, cause: str, cure: str, reason: str) -> None:
+def test_a_failing_check_of_px4_is_the_reason(
+    flight: Flight, cause: str, cure: str, reasons: tuple[str, ...]
+) -> None:
     link = flight.link
     if link.autopilot != PX4:
         pytest.skip("the shell is PX4's")
+    if "COM_ARMABLE" in cause and link.parameter("COM_ARMABLE") is None:
+        pytest.skip(f"{link.name} has no COM_ARMABLE")
     link.shell(cause)
     try:
-        assert_arming_is_refused(flight, reason)
+        assert_arming_is_refused(flight, *reasons)
     finally:
         link.shell(cure)
         link.until(lambda: link.ready, READY_S, "ready to be armed")
