@@ -74,6 +74,7 @@ class AutopilotLink:
 
     Attributes:
         service_port: the service listens there. address: where the autopilot's messages arrive.
+        camera_port: a rendered camera listens there; None: none.
         cut: nothing is passed on while it is true; what the autopilot sends is still recorded.
         uplink_deaf: what the service sends is not passed on while it is true; it is still recorded.
         autopilot, vehicle_type, system_id: MAV_AUTOPILOT and MAV_TYPE of its heartbeat, and who sent it; None
@@ -95,6 +96,7 @@ class AutopilotLink:
 
     def __init__(self, url: LinkUrl) -> None:
         self.service_port, self.address = free_port(), url.address
+        self.camera_port: int | None = None
         self.cut = self.uplink_deaf = False
         self.autopilot: int | None = None
         self.system_id = self.vehicle_type = 0
@@ -333,7 +335,9 @@ class AutopilotLink:
                         self._changed.notify_all()
                     continue
                 if not self.cut:
-                    self._near.sendto(data, ("127.0.0.1", self.service_port))
+                    for port in (self.service_port, self.camera_port):
+                        if port is not None:
+                            self._near.sendto(data, ("127.0.0.1", port))
                 messages = from_autopilot.parse_buffer(data) or []
                 with self._changed:
                     for message in messages:
