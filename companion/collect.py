@@ -9,6 +9,8 @@ import json
 import queue
 from collections import Counter
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -17,8 +19,9 @@ import cv2
 import numpy as np
 import yaml
 
-from companion.bus.client import open_client
-from companion.bus.topics import DETECTIONS, IMAGE
+from companion.bus.client import message_of, open_client
+from companion.bus.topics import DETECTIONS, IMAGE, Topic
+from companion.peer_data import PeerDataError, parse_object
 from companion.recording import RecordingError
 from companion.recording.frames import DetectedFrame
 from companion.settings import ZenohSection
@@ -187,36 +190,38 @@ def live_frames(
     Raises:
         NoAnswerError: no service at the endpoint. RecordingError: detections are drawn into the images.
     """
-    received: queue.Queue[tuple[bytes, bytes | None]] = queue.Queue()
+    received: queue.Queue[tuple[Topic, bytes, bytes | None]] = queue.Queue(_MOST_WAITING)
     waiting: dict[int, Any] = {}
 
-    def receive(sample: Any) -> None:
-        attachment = sample.attachment
-        received.put((sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()))
+    def receive(topic: Topic, sample: Any) -> None:
+        # One that is too large is ignored; while the reader is late, so are new ones.
+        with suppress(PeerDataError, queue.Full):
+            received.put_nowait((topic, *message_of(sample, topic)))
 
     with open_client(zenoh) as session:
         subscribers = [
-            session.declare_subscriber(topic.key(vehicle, camera), receive) for topic in (DETECTIONS, IMAGE)
+            session.declare_subscriber(topic.key(vehicle, camera), partial(receive, topic))
+            for topic in (DETECTIONS, IMAGE)
         ]
         while not ending.is_set():
             try:
-                payload, attachment = received.get(timeout=_POLL_S)
-            except queue.Empty:
+                topic, payload, attachment = received.get(timeout=_POLL_S)
+                about = parse_object(payload if topic is DETECTIONS else attachment or b"{}")
+                stamp_ns = about["captured_ns"]
+            except (queue.Empty, PeerDataError, KeyError):  # none, or another program's
                 continue
-            if attachment is None:
-                message = json.loads(payload)
-                waiting[message["captured_ns"]] = message
+            if topic is DETECTIONS:
+                waiting[stamp_ns] = about
                 waiting = dict(list(waiting.items())[-_MOST_WAITING:])
                 continue
-            about = json.loads(attachment)
-            if about["annotated"]:
+            if about.get("annotated"):
                 raise RecordingError(
                     f"{vehicle}: detections are drawn into its images: set preview.annotate = false"
                 )
-            found = waiting.get(about["captured_ns"])
+            found = waiting.get(stamp_ns)
             image = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
             if found is not None and image is not None:
-                yield DetectedFrame(about["captured_ns"], image.astype(np.uint8, copy=False), found)
+                yield DetectedFrame(stamp_ns, image.astype(np.uint8, copy=False), found)
         for subscriber in subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 

@@ -6,7 +6,7 @@ A reader gets values that cannot surprise it: no recursion, no NaN or infinity, 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Protocol
 
 from pydantic_core import from_json
 
@@ -17,6 +17,22 @@ _LARGEST_INTEGER = 2**64
 
 class PeerDataError(ValueError):
     """Data of a peer cannot be used. The message is one line."""
+
+
+class Payload(Protocol):
+    """Bytes that are not copied yet, such as zenoh's ZBytes."""
+
+    def __len__(self) -> int: ...
+
+    def to_bytes(self) -> bytes:
+        """Return a copy."""
+        ...
+
+
+def copy_payload(payload: Payload, largest_bytes: int) -> bytes:
+    """Return a copy of what a peer sent. Nothing else copies it. Raises PeerDataError: it is too large."""
+    check_size(len(payload), largest_bytes)
+    return payload.to_bytes()
 
 
 def check_size(size: int, largest_bytes: int) -> None:

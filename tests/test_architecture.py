@@ -135,6 +135,13 @@ AWAITED_TASKS = {
     "companion/sim_session.py",
     "companion/tasks.py",
 }
+# File → places that copy a payload. The simulator does not import the companion: it checks by itself; a
+# payload of MAVLink has at most 255 bytes.
+COPIES_OF_PAYLOADS = {
+    "companion/peer_data.py": 1,
+    "mavlink_sim/faults/injector.py": 1,
+    "mavlink_sim/services/file_transfer.py": 1,
+}
 SERVICE, MAX_SERVICE_LINES = ROOT / "companion" / "service", 250
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
@@ -412,3 +419,49 @@ def test_no_background_task_ends_unseen() -> None:
             if isinstance(node, ast.Attribute) and node.attr in starts:
                 found.add(str(path.relative_to(ROOT)))
     assert found == AWAITED_TASKS
+
+
+def _unbounded_copies(tree: ast.AST) -> list[int]:
+    """Lines that copy the bytes of a zenoh payload: `to_bytes` and `to_string` without arguments, or `bytes`.
+
+    `int.to_bytes` has arguments.
+    """
+    called = {
+        id(node.func)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and (node.args or node.keywords)
+    }
+    lines = [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and node.attr in ("to_bytes", "to_string")
+        and id(node) not in called
+    ]
+    lines += [
+        node.lineno
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id in ("bytes", "bytearray", "str", "memoryview")
+        and any(isinstance(one, ast.Attribute) and one.attr in ("payload", "attachment") for one in node.args)
+    ]
+    return lines
+
+
+def test_only_one_function_copies_what_a_peer_sent() -> None:
+    """`companion.peer_data.copy_payload` checks the size first; `vision` does not know zenoh."""
+    found = {}
+    for package in ("companion", "mavlink_sim"):
+        for path in (ROOT / package).rglob("*.py"):
+            if lines := _unbounded_copies(ast.parse(path.read_text())):
+                found[path.relative_to(ROOT).as_posix()] = len(lines)
+    assert found == COPIES_OF_PAYLOADS
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["sample.payload.to_bytes()", "queue.offer(payload.to_bytes)", "str(sample.payload)", "a.ok.to_string()"],
+)
+def test_an_unbounded_copy_is_found(text: str) -> None:
+    assert _unbounded_copies(ast.parse(text)) == [1]

@@ -39,8 +39,8 @@ _INVERTED = 1e-9
 class CameraModel:
     """Intrinsics of one camera. Focal lengths and principal point in pixels.
 
-    Raises ValueError for a size or focal length that is not positive, or coefficients that do not belong to
-    the distortion model.
+    Raises ValueError for a size or focal length that is not positive, a number that is not finite, or
+    coefficients that do not belong to the distortion model.
 
     >>> import math
     >>> from vision import CameraModel
@@ -63,6 +63,11 @@ class CameraModel:
             raise ValueError(
                 f"a camera needs a positive size and focal length, got {self.width}x{self.height}, "
                 f"fx {self.fx}, fy {self.fy}"
+            )
+        if not all(map(math.isfinite, (self.fx, self.fy, self.cx, self.cy, *self.distortion))):
+            raise ValueError(
+                f"a camera's numbers must be finite, got fx {self.fx}, fy {self.fy}, cx {self.cx}, "
+                f"cy {self.cy}, distortion {self.distortion}"
             )
         check_distortion(self.distortion_model, self.distortion)
         object.__setattr__(self, "distortion", tuple(self.distortion))  # a list has no hash

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import multiprocessing
 import os
 import socket
@@ -26,6 +25,7 @@ from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus, encode
+from companion.peer_data import copy_payload, parse_object
 from companion.perception.messages import Report, StartFailed
 from companion.perception.process import PerceptionProcess
 from companion.scheduling import schedule_as_any_program, set_scheduler_slice
@@ -249,7 +249,7 @@ def _read_detections(endpoint: str, connection: Connection) -> None:
 
     def receive(sample: zenoh.Sample) -> None:
         received_ns = time.monotonic_ns()
-        sequence = json.loads(sample.payload.to_bytes())["sequence"]
+        sequence = parse_object(copy_payload(sample.payload, topics.DETECTIONS.largest_bytes))["sequence"]
         if sequence >= 0:
             times.append((sequence, received_ns))
 
@@ -272,7 +272,7 @@ def _read_events(endpoint: str, connection: Connection) -> None:
 
     def receive(sample: zenoh.Sample) -> None:
         nonlocal newest
-        number = json.loads(sample.payload.to_bytes())["stamp_ns"]
+        number = parse_object(copy_payload(sample.payload, topics.EVENTS.largest_bytes))["stamp_ns"]
         started.set()
         with changed:
             missing.discard(number)

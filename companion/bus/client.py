@@ -21,10 +21,11 @@ from companion.bus.topics import (
     LARGEST_JSON_BYTES,
     ROOT,
     TOPICS,
+    Topic,
     alive_key,
     command_key,
 )
-from companion.peer_data import PeerDataError, check_size, parse_object
+from companion.peer_data import PeerDataError, copy_payload, parse_object
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0
@@ -120,6 +121,7 @@ def send_command(
 
     Raises:
         NoAnswerError: no service for this vehicle, it has gone meanwhile, or no answer within `timeout_s`.
+        PeerDataError: the answer cannot be used.
     """
     received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
     # The service's liveliness token shows whether it is there (it may arrive shortly after connecting), and
@@ -161,8 +163,7 @@ def _answer(
         except queue.Empty:
             item = None
         if isinstance(item, zenoh.Reply) and item.ok is not None:
-            answer: dict[str, Any] = json.loads(item.ok.payload.to_string())
-            return answer
+            return parse_object(copy_payload(item.ok.payload, LARGEST_JSON_BYTES))
         if _is(item, zenoh.SampleKind.DELETE):
             wait_s, gone = _LAST_ANSWER_S, True  # an answer may have been sent just before
         elif _is(item, zenoh.SampleKind.PUT):
@@ -235,18 +236,28 @@ def subscribe_kept(
     )
 
 
+def message_of(sample: zenoh.Sample, topic: Topic) -> tuple[bytes, bytes | None]:
+    """Return payload and attachment of a message. Raises PeerDataError: too large for its topic."""
+    attachment = sample.attachment
+    about = None if attachment is None else copy_payload(attachment, LARGEST_JSON_BYTES)
+    return copy_payload(sample.payload, topic.largest_bytes), about
+
+
 def image_of(sample: zenoh.Sample) -> tuple[bytes, dict[str, Any]]:
     """Return a preview image, JPEG, and its attachment. Raises PeerDataError: too large, or not valid."""
-    check_size(len(sample.payload), IMAGE.largest_bytes)
-    attachment = sample.attachment
-    if attachment is None:
+    jpeg, about = message_of(sample, IMAGE)
+    if about is None:
         raise PeerDataError("an image without an attachment")
-    check_size(len(attachment), LARGEST_JSON_BYTES)
-    return sample.payload.to_bytes(), parse_object(attachment.to_bytes())
+    return jpeg, parse_object(about)
 
 
 def _text_of(sample: zenoh.Sample) -> str:
-    if sample.encoding not in (zenoh.Encoding.IMAGE_JPEG, zenoh.Encoding.APPLICATION_OCTET_STREAM):
-        return sample.payload.to_string()
-    attachment = "" if sample.attachment is None else f" {sample.attachment.to_string()}"
-    return f"<{sample.encoding}, {len(sample.payload)} bytes>{attachment}"
+    """Return a text message, or what is known of one that is binary or too large for any topic of text."""
+    size, attachment = len(sample.payload), sample.attachment
+    binary = sample.encoding in (zenoh.Encoding.IMAGE_JPEG, zenoh.Encoding.APPLICATION_OCTET_STREAM)
+    if not binary and size <= LARGEST_JSON_BYTES:
+        return copy_payload(sample.payload, LARGEST_JSON_BYTES).decode(errors="replace")
+    if attachment is None or len(attachment) > LARGEST_JSON_BYTES:
+        return f"<{sample.encoding}, {size} bytes>"
+    about = copy_payload(attachment, LARGEST_JSON_BYTES).decode(errors="replace")
+    return f"<{sample.encoding}, {size} bytes> {about}"

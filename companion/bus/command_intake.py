@@ -10,6 +10,8 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
+from companion.peer_data import Payload, PeerDataError, copy_payload
+
 LARGEST_COMMAND_BYTES = 160 * 1024
 """A line, and for a mission its file."""
 COMMANDS_PER_S, BURST = 20.0, 40
@@ -42,16 +44,17 @@ class CommandIntake:
         self._lock = threading.Lock()
         self.refused = 0
 
-    def read(self, size: int, payload: Callable[[], bytes], sender: bytes = b"") -> tuple[str | None, str]:
+    def read(self, payload: Payload, sender: bytes = b"") -> tuple[str | None, str]:
         """Return the command's text, or None and why it is refused.
 
         Args:
-            size: of the payload, bytes. payload: called only if the size is allowed.
+            payload: copied only if its size is allowed.
             sender: as it states itself; empty if it does not.
         """
-        if size > LARGEST_COMMAND_BYTES:
-            return self._refuse(f"{size} bytes, at most {LARGEST_COMMAND_BYTES} are accepted")
-        data = payload()
+        try:
+            data = copy_payload(payload, LARGEST_COMMAND_BYTES)
+        except PeerDataError as error:
+            return self._refuse(str(error))
         with self._lock:
             allowance = self._stops if data.strip().lower() == SEPARATE_ALLOWANCE else self._others
             accepted = allowance.take(sender)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.topics import Topic
-from companion.peer_data import PeerDataError, check_size
+from companion.peer_data import Payload, PeerDataError, copy_payload
 
 logger = logging.getLogger(__name__)
 
@@ -68,14 +68,13 @@ class ListenerQueue:
         self.ignored = self._unreported = 0
         self._warned_s = -WARN_INTERVAL_S
 
-    def offer(self, size: int, payload: Callable[[], bytes], received_ns: int) -> None:
-        """Add a message, from any thread. `payload`: called only if its size is accepted."""
+    def offer(self, payload: Payload, received_ns: int) -> None:
+        """Add a message, from any thread. `payload`: copied only if its size is accepted."""
         try:
-            check_size(size, self.topic.largest_bytes)
+            data = copy_payload(payload, self.topic.largest_bytes)
         except PeerDataError as error:
             self._ignore(str(error))
             return
-        data = payload()
         with self._lock:
             full = len(self._waiting) >= MAX_WAITING
             if full:

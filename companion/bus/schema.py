@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import zenoh
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 from pydantic.json_schema import GenerateJsonSchema
 from typing_extensions import get_original_bases
 
 from companion.bus.bodies import frames, service, vehicle
 from companion.bus.topics import INPUT_TOPICS, TOPICS, Topic
+from companion.peer_data import PeerDataError, parse_object
 from companion.settings.section import texts_below_keys
 
 DIALECT = GenerateJsonSchema.schema_dialect
@@ -34,6 +36,27 @@ def schema_of(body: Any) -> dict[str, Any]:
         for key, text in _texts_of(name).items():
             part["properties"][key]["description"] = text
     return {"$schema": DIALECT, **schema}
+
+
+@cache
+def _adapter(body: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(body)
+
+
+def read_body(topic: Topic, data: bytes) -> dict[str, Any]:
+    """Return the body of a message, or of its attachment, whose size was checked; unknown fields stay.
+
+    Raises:
+        PeerDataError: it is not what the topic says.
+    """
+    value = parse_object(data)
+    try:
+        _adapter(topic.body).validate_python(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise PeerDataError(f"{topic.name}: {where}: {first['msg']}") from None
+    return value
 
 
 def _texts_of(name: str) -> dict[str, str]:

@@ -36,6 +36,7 @@ from companion.bus.topics import (
     alive_key,
     command_key,
 )
+from companion.peer_data import Payload, copy_payload
 from companion.scheduling import set_scheduler_slice
 from companion.settings import ZenohSection
 from companion.tasks import spawn
@@ -350,13 +351,13 @@ class Bus:
 
     @staticmethod
     def _on_sample(queue: ListenerQueue, sample: zenoh.Sample) -> None:
-        payload = sample.payload
-        queue.offer(len(payload), payload.to_bytes, time.monotonic_ns())
+        queue.offer(sample.payload, time.monotonic_ns())
 
     def _from_zenoh_thread(self, query: zenoh.Query) -> None:
         sender = query.attachment
         known = sender is not None and len(sender) <= MAX_SENDER_BYTES
-        text, why = self.intake.read(*_payload(query), sender.to_bytes() if known and sender else b"")
+        stated = copy_payload(sender, MAX_SENDER_BYTES) if known and sender else b""
+        text, why = self.intake.read(_payload(query), stated)
         loop = self._loop
         if text is not None and loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(lambda: self._spawn(self._answer(query, text)))
@@ -444,13 +445,12 @@ def _open(config: zenoh.Config) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def _payload(query: zenoh.Query) -> tuple[int, Callable[[], bytes]]:
-    """Return size and bytes of a command: the query's payload, or its parameter `text` (`…?text=hold`)."""
+def _payload(query: zenoh.Query) -> Payload:
+    """Return a command: the query's payload, or its parameter `text` (`…?text=hold`)."""
     payload = query.payload
     if payload is not None and len(payload):
-        return len(payload), payload.to_bytes
-    text = str(query.parameters.get("text", "")).encode("utf-8", "replace")
-    return len(text), lambda: text
+        return payload
+    return zenoh.ZBytes(str(query.parameters.get("text", "")).encode("utf-8", "replace"))
 
 
 def _reply(query: zenoh.Query, reply: dict[str, Any]) -> None:

@@ -22,7 +22,7 @@ from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBod
 from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.stream import Stream
-from companion.peer_data import PeerDataError, check_size, parse_object
+from companion.peer_data import PeerDataError, copy_payload, parse_json, parse_object
 from companion.settings import ZenohSection
 
 # Longer than any command; a caller's `asyncio.timeout` ends it earlier.
@@ -101,8 +101,8 @@ class Steering:
 
     def _on_status(self, sample: zenoh.Sample) -> None:
         try:
-            check_size(len(sample.payload), topics.STATUS.largest_bytes)
-            behaviour = str(parse_object(sample.payload.to_bytes())["pilot"]["behaviour"])
+            status = parse_object(copy_payload(sample.payload, topics.STATUS.largest_bytes))
+            behaviour = str(status["pilot"]["behaviour"])
         except (PeerDataError, KeyError, TypeError):
             return  # another program's
         self._statuses += 1
@@ -232,13 +232,13 @@ class Drone(Commands):
         """Ask one of the queryables status, config, models, commands.
 
         Raises:
-            NoAnswerError: no answer within 10 s.
+            NoAnswerError: no answer within 10 s. PeerDataError: the answer cannot be used.
         """
 
         def ask() -> Any:
             for reply in self._session.get(f"{topics.ROOT}/{self.name}/{path}", timeout=_QUERY_S):
                 if reply.ok is not None:
-                    return json.loads(reply.ok.payload.to_string())
+                    return parse_json(copy_payload(reply.ok.payload, topics.LARGEST_JSON_BYTES))
             raise NoAnswerError(f"{path}: no answer from vehicle {self.name!r} within {_QUERY_S:g} s")
 
         return await asyncio.to_thread(ask)

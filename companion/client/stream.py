@@ -15,7 +15,7 @@ import zenoh
 
 from companion.bus.client import subscribe_kept
 from companion.bus.topics import Topic
-from companion.peer_data import PeerDataError
+from companion.peer_data import PeerDataError, copy_payload
 
 T = TypeVar("T")
 
@@ -32,11 +32,12 @@ class _Queue:
 
     def put(self, sample: zenoh.Sample) -> None:
         """Add a message, from any thread. The loop is woken once, however many arrive meanwhile."""
-        if len(sample.payload) > self._largest_bytes:
+        try:
+            item = copy_payload(sample.payload, self._largest_bytes), time.monotonic()
+        except PeerDataError:
             with self._lock:
                 self.dropped += 1
             return
-        item = sample.payload.to_bytes(), time.monotonic()
         with self._lock:
             self.dropped += len(self._items) == self._items.maxlen
             self._items.append(item)

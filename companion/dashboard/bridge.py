@@ -31,7 +31,7 @@ from companion.bus.topics import (
     VEHICLE,
 )
 from companion.dashboard.merge import Sighting
-from companion.peer_data import PeerDataError, check_size, parse_object
+from companion.peer_data import PeerDataError, copy_payload, parse_object
 
 logger = logging.getLogger(__name__)
 
@@ -335,8 +335,7 @@ def _is_plausible(one: Sighting) -> bool:
 def _json(sample: zenoh.Sample) -> dict[str, Any] | None:
     """Return a message's object; None if it is none, too large, or not strict JSON, which browsers need."""
     try:
-        check_size(len(sample.payload), LARGEST_JSON_BYTES)
-        return parse_object(sample.payload.to_bytes())
+        return parse_object(copy_payload(sample.payload, LARGEST_JSON_BYTES))
     except PeerDataError:
         return None
 

@@ -19,6 +19,7 @@ from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import LanguageError
 from companion.language.sentences import is_stop
 from companion.operator.reply_text import ENDED_BY_STOP
+from companion.peer_data import PeerDataError, copy_payload
 from companion.tasks import spawn
 
 ASK = "ask"
@@ -64,10 +65,12 @@ async def serve(session: zenoh.Session, vehicle: str, converse: Callable[[Operat
     async def answer(query: zenoh.Query) -> None:
         nonlocal lines, running
         sentence = query.payload
-        if sentence is not None and len(sentence) > MAX_SENTENCE_BYTES:
-            await reply(query, f"the sentence has {len(sentence)} bytes, at most {MAX_SENTENCE_BYTES}", "")
+        try:
+            data = b"" if sentence is None else copy_payload(sentence, MAX_SENTENCE_BYTES)
+        except PeerDataError as error:
+            await reply(query, f"sentence refused: {error}", "")
             return
-        text = (b"" if sentence is None else sentence.to_bytes()).decode(errors="replace")
+        text = data.decode(errors="replace")
         if is_stop(text):
             if running is not None:
                 running.cancel()  # first: it sends nothing after the stop

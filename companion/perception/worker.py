@@ -232,6 +232,10 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
         try:
             with _heartbeat_while_loading(settings, sender):
                 perception = _open(begin, stack, sender)
+                if perception.source.calibration is not None:
+                    adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
+                    settings = settings.model_copy(update={"camera": adopted})
+                    perception.clouds.camera = adopted
         except (
             PluginError,
             SourceError,
@@ -247,10 +251,6 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
         gc.collect()
         gc.freeze()
         sender.put(_ready(perception))
-        if perception.source.calibration is not None:
-            adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
-            settings = settings.model_copy(update={"camera": adopted})
-            perception.clouds.camera = adopted
         perception = replace(perception, plan=_planner(settings, control, sender))
         if perception.recording is not None and settings.recording.level:
             perception.recording.level = build_levelling(settings, control.telemetry)

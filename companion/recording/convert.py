@@ -17,8 +17,9 @@ from typing import Any
 
 from typing_extensions import TypedDict
 
-from companion.bus.schema import schema_of
+from companion.bus.schema import read_body, schema_of
 from companion.bus.topics import (
+    CAMERA_INFO,
     CLOUD,
     DEPTH_IMAGE,
     DETECTIONS,
@@ -27,6 +28,7 @@ from companion.bus.topics import (
     GUIDANCE_OUTPUT,
     IMAGE,
     LABELS,
+    LARGEST_BINARY_BYTES,
     MAVLINK,
     RUN,
     SETPOINT,
@@ -34,6 +36,7 @@ from companion.bus.topics import (
     VEHICLE,
     Topic,
 )
+from companion.peer_data import parse_object
 from companion.recording.files import Channel, Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
 from companion.recording.link_bytes import unpack_link_bytes
@@ -134,19 +137,20 @@ class Converter:
             yield from self._link_bytes(payload)
             return
         if name == IMAGE.name:
-            yield self._image(camera, payload, json.loads(attachment or b"{}"))
+            yield self._image(camera, payload, parse_object(attachment or b"{}"))
             return
         if name == DEPTH_IMAGE.name:
-            yield self._depth_image(camera, payload, json.loads(attachment or b"{}"))
+            yield self._depth_image(camera, payload, parse_object(attachment or b"{}"))
             return
         if name == CLOUD.name:
-            yield self._cloud(camera, payload, json.loads(attachment or b"{}"))
+            yield self._cloud(camera, payload, parse_object(attachment or b"{}"))
             return
         if name == LABELS.name:
             text = json.dumps({"labels": payload.decode()}).encode()
             yield Recorded(Channel(path, "companion.labels", stored_schema(LabelsBody)), time.time_ns(), text)
             return
-        message = json.loads(payload)
+        # A calibration has lists of a fixed length, which a viewer does not check.
+        message = read_body(CAMERA_INFO, payload) if name == CAMERA_INFO.name else parse_object(payload)
         if path == RUN.name:
             self._on_run(message)
         elif path == GUIDANCE_INPUT.name:
@@ -165,7 +169,7 @@ class Converter:
             SETPOINT.name: self._path,
             EVENTS.name: self._log,
             "transforms": self._transforms,
-            "camera_info": self._calibration,
+            CAMERA_INFO.name: self._calibration,
         }.get(name)
         if make is not None and topic == path:
             for converted_topic, kind, body in make(camera, message):
@@ -206,6 +210,8 @@ class Converter:
     def _depth_image(self, camera: str, packed: bytes, about: dict[str, Any]) -> Recorded:
         captured_ns, width, height = about["captured_ns"], about["width"], about["height"]
         size = 2 * width * height
+        if not (width > 0 < height and size <= LARGEST_BINARY_BYTES):
+            raise ValueError(f"a depth image of {width}x{height}: at most {LARGEST_BINARY_BYTES} bytes")
         try:
             data = zlib.decompressobj().decompress(packed, size + 1)
         except zlib.error as error:

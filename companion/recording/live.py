@@ -7,14 +7,15 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from threading import Event, Lock
 
 import foxglove
 import zenoh
 from foxglove.websocket import ChannelView, Client, ServerListener
 
-from companion.bus.client import open_client
-from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS
+from companion.bus.client import message_of, open_client
+from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS, Topic
 from companion.recording import RecordingError
 from companion.recording.convert import Converter, large_channel
 from companion.recording.files import Channel
@@ -69,9 +70,11 @@ class Live(ServerListener):
         with self._lock:
             self._viewers[channel.topic] += 1
             name = channel.topic.rpartition("/")[2]
-            if self._viewers[channel.topic] == 1 and name in {topic.name for topic in LARGE_TOPICS}:
+            large = next((topic for topic in LARGE_TOPICS if topic.name == name), None)
+            if self._viewers[channel.topic] == 1 and large is not None:
                 key = f"{ROOT}/{self._vehicle}{channel.topic}"
-                self._large[channel.topic] = self._session.declare_subscriber(key, self._on_sample)
+                receive = partial(self._on_sample, large)
+                self._large[channel.topic] = self._session.declare_subscriber(key, receive)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         """Called by the server: a viewer shows a topic no more."""
@@ -81,23 +84,19 @@ class Live(ServerListener):
         if unused is not None:
             unused.undeclare()  # type: ignore[no-untyped-call]
 
-    def _on_sample(self, sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
+    def _on_sample(self, topic: Topic, sample: zenoh.Sample) -> None:
         path = str(sample.key_expr).removeprefix(f"{ROOT}/{self._vehicle}/")
         try:
+            payload, attachment = message_of(sample, topic)
             with self._lock:
-                messages = list(
-                    self._converter.convert(
-                        path, sample.payload.to_bytes(), None if attachment is None else attachment.to_bytes()
-                    )
-                )
+                messages = list(self._converter.convert(path, payload, attachment))
                 if path == RUN.name:
                     for camera in json.loads(messages[0].data)["settings"]["cameras"]:
                         for topic in LARGE_TOPICS:
                             self._channel(large_channel(topic, f"cameras/{camera}"))
                 channels = [self._channel(message.channel) for message in messages]
         except (ValueError, KeyError, TypeError):
-            return  # of another version, or another program's
+            return  # of another version, another program's, or too large
         for channel, message in zip(channels, messages, strict=True):
             channel.log(message.data, log_time=message.log_time_ns)
 

@@ -8,15 +8,17 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from threading import Event
+from threading import Event, Lock
 from typing import Any
 
 import zenoh
 from typing_extensions import TypedDict
 
-from companion.bus.client import open_client, subscribe_kept
+from companion.bus.client import message_of, open_client, subscribe_kept
 from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
+from companion.peer_data import PeerDataError
 from companion.recording import RecordingError
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
@@ -25,7 +27,7 @@ from companion.settings import ZenohSection
 
 # The service and its perception have priority.
 _NICER = 10
-MAX_WAITING = 10_000
+MAX_WAITING, MAX_WAITING_BYTES = 10_000, 512 * 1024 * 1024
 _POLL_S = 0.05
 # The last messages of a service that ends may still arrive.
 _LAST_S = 0.3
@@ -88,8 +90,9 @@ class Recorder:
             max_total_bytes=options.max_total_mb * 1_000_000,
         )
         self._converter = Converter(options.vehicle)
-        self._waiting: deque[tuple[str, bytes, bytes | None]] = deque(maxlen=MAX_WAITING)
-        self._added = self._taken = self._unread = 0
+        self._waiting: deque[tuple[str, bytes, bytes | None]] = deque()
+        self._added = self._taken = self._unread = self._too_large = 0
+        self._lock, self._waiting_bytes = Lock(), 0
         self.dropped_images = 0
         self._noted: LossesBody | None = None
         self._flush_due_s = 0.0
@@ -105,18 +108,31 @@ class Recorder:
         return len(self._waiting) > MAX_WAITING // 10
 
     def add(self, path: str, payload: bytes, attachment: bytes | None) -> None:
-        """Queue a message; if the writer is late, the oldest is dropped."""
-        self._added += 1
-        self._waiting.append((path, payload, attachment))
+        """Queue a message; if the writer is late, the oldest are dropped."""
+        with self._lock:
+            self._added += 1
+            self._waiting.append((path, payload, attachment))
+            self._waiting_bytes += len(payload)
+            while len(self._waiting) > MAX_WAITING or self._waiting_bytes > MAX_WAITING_BYTES:
+                self._waiting_bytes -= len(self._waiting.popleft()[1])
+
+    def count_too_large(self) -> None:
+        """Count a message that was not copied, as one that could not be read."""
+        with self._lock:
+            self._too_large += 1
 
     def write(self) -> None:
         """Write what is queued. Raises RecordingError."""
         for _ in range(len(self._waiting)):
-            path, payload, attachment = self._waiting.popleft()
-            self._taken += 1
+            with self._lock:
+                if not self._waiting:
+                    break  # dropped meanwhile
+                path, payload, attachment = self._waiting.popleft()
+                self._waiting_bytes -= len(payload)
+                self._taken += 1
             try:
                 messages = list(self._converter.convert(path, payload, attachment))
-            except (ValueError, KeyError, TypeError, RecursionError):
+            except (ValueError, KeyError, TypeError):
                 self._unread += 1  # of another version, or another program's
                 continue
             for message in messages:
@@ -147,13 +163,15 @@ class Recorder:
 
     def _note_losses(self) -> None:
         """Write what was lost, as it changes: a recording with a gap says so."""
+        with self._lock:
+            dropped = self._added - self._taken - len(self._waiting)
         note: LossesBody = {
             "first_step": self._converter.first_step,
             "lost_steps": self._converter.lost_steps,
             "lost_link_pieces": self._converter.lost_pieces,
-            "dropped_messages": self._added - self._taken - len(self._waiting),
+            "dropped_messages": dropped,
             "dropped_images": self.dropped_images,
-            "unread_messages": self._unread,
+            "unread_messages": self._unread + self._too_large,
         }
         if note != self._noted:
             self._noted = note
@@ -172,7 +190,10 @@ def topics_of(options: RecorderOptions) -> list[Topic]:
 
 
 def subscribe_all(
-    session: zenoh.Session, vehicle: str, topics: Sequence[Topic], receive: Callable[[zenoh.Sample], None]
+    session: zenoh.Session,
+    vehicle: str,
+    topics: Sequence[Topic],
+    receive: Callable[[Topic, zenoh.Sample], None],
 ) -> list[Any]:
     """Subscribe to topics of all cameras; those with kept messages begin with them."""
     subscribers: list[Any] = []
@@ -180,7 +201,7 @@ def subscribe_all(
         for view in (None, "*") if topic.of_camera else (None,):
             key = topic.key(vehicle, view)
             subscribe = subscribe_kept if topic.cached else zenoh.Session.declare_subscriber
-            subscribers.append(subscribe(session, key, receive))
+            subscribers.append(subscribe(session, key, partial(receive, topic)))
     return subscribers
 
 
@@ -223,13 +244,13 @@ def _write_until(
     """Write what arrives until `ending` is set. Raises RecordingError."""
     prefix = f"{ROOT}/{options.vehicle}/"
 
-    def receive(sample: zenoh.Sample) -> None:
-        attachment = sample.attachment
-        recorder.add(
-            str(sample.key_expr).removeprefix(prefix),
-            sample.payload.to_bytes(),
-            None if attachment is None else attachment.to_bytes(),
-        )
+    def receive(topic: Topic, sample: zenoh.Sample) -> None:
+        try:
+            payload, attachment = message_of(sample, topic)
+        except PeerDataError:
+            recorder.count_too_large()
+            return
+        recorder.add(str(sample.key_expr).removeprefix(prefix), payload, attachment)
 
     with ExitStack() as stack:
         for subscriber in subscribe_all(session, options.vehicle, topics_of(options), receive):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
+from pydantic import ValidationError
+
 from companion.settings.perception import LENS_KEYS, CameraSection, lens_settings
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 
@@ -27,6 +29,9 @@ def adopt_calibration(section: CameraSection, calibration: CameraCalibration) ->
     The lens is one unit: if any of its keys is given, all come from the settings. The same holds for the
     reference of the mount's angles (`stabilized`, `on_gimbal`): if it differs, the angles come from the
     settings too. `conflict` lists each given value that differs, with the camera's; empty: none.
+
+    Raises:
+        ValueError: the camera's calibration is not what the settings accept. The message is one line.
     """
     given = section.model_fields_set
     changes: dict[str, Any] = {}
@@ -34,7 +39,17 @@ def adopt_calibration(section: CameraSection, calibration: CameraCalibration) ->
     _adopt_lens(section, calibration.model, given, changes, conflicts)
     if calibration.mount is not None:
         _adopt_mount(section, calibration.mount, given, changes, conflicts)
-    return AdoptedCamera(section.model_copy(update=changes), "; ".join(conflicts))
+    values = {key: getattr(section, key) for key in given} | changes
+    try:
+        camera = CameraSection.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key, got = ".".join(map(str, first["loc"])), "" if not first["loc"] else f", got {first['input']}"
+        raise ValueError(
+            f"the camera's own calibration cannot be used: {key or 'lens'}: {first['msg']}{got}; correct it "
+            "in the program that shares the frames, or set camera.calibration_file"
+        ) from None
+    return AdoptedCamera(camera, "; ".join(conflicts))
 
 
 def _adopt_lens(

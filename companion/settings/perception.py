@@ -97,6 +97,10 @@ LENS_KEYS = frozenset(
 )
 
 
+# Focal length over the image's size: of a pinhole camera of 179° and of 1°.
+_LEAST_FOCAL, _MOST_FOCAL = 0.0043, 58.0
+
+
 class CameraSection(Section):
     """Lens and mount; unset keys come from the camera's calibration, if any. Body: forward, right, down."""
 
@@ -165,12 +169,32 @@ class CameraSection(Section):
                 "on_gimbal and stabilized exclude each other: a gimbal reports its attitude (on_gimbal), "
                 "or one that reports nothing and holds the camera level (stabilized)"
             )
+        if not missing:
+            self._check_lens()
         check_distortion(self.distortion_model, self.distortion)
         if self.distortion_model == "equidistant" and missing:
             raise ValueError(
                 "distortion_model equidistant needs a calibration: fx_px, fy_px… or calibration_file"
             )
         return self
+
+    def _check_lens(self) -> None:
+        """Raise ValueError for a lens that no camera has: 179° to 1° across, the axis near the image."""
+        for axis, size, focal_px, centre_px in (
+            ("x", self.calibrated_width, self.fx_px, self.cx_px),
+            ("y", self.calibrated_height, self.fy_px, self.cy_px),
+        ):
+            if size is None or focal_px is None or centre_px is None:
+                continue
+            if not _LEAST_FOCAL * size <= focal_px <= _MOST_FOCAL * size:
+                raise ValueError(
+                    f"f{axis}_px of images of {size} pixels must be {_LEAST_FOCAL * size:.3g} to "
+                    f"{_MOST_FOCAL * size:.3g}, got {focal_px:g}"
+                )
+            if not -size <= centre_px <= 2 * size:
+                raise ValueError(
+                    f"c{axis}_px of images of {size} pixels must be {-size} to {2 * size}, got {centre_px:g}"
+                )
 
     def model(self, width: int, height: int) -> CameraModel:
         """Return the camera model for frames of this size, pixels.

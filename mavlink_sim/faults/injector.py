@@ -84,8 +84,8 @@ class FaultControl:
 
     def _answer(self, query: Any) -> None:
         payload = query.payload
-        data = payload.to_bytes() if payload is not None else b""
-        text = data[:LONGEST_COMMAND_BYTES].decode(errors="replace")
+        accepted = payload is not None and len(payload) <= LONGEST_COMMAND_BYTES
+        text = payload.to_bytes().decode(errors="replace") if accepted else ""
         if not text:
             text = query.parameters.get("fault", "")
         outcome = self._faults.command(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zenoh
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,7 +24,7 @@ class Clock:
 
 
 def read(intake: CommandIntake, data: bytes, sender: bytes = b"") -> tuple[str | None, str]:
-    return intake.read(len(data), lambda: data, sender)
+    return intake.read(zenoh.ZBytes(data), sender)
 
 
 def test_burst_then_limited_rate() -> None:
@@ -62,10 +63,14 @@ def test_invented_senders_share_a_limit_and_are_forgotten() -> None:
 
 
 def test_too_large_payload_is_not_read() -> None:
-    def payload() -> bytes:
-        raise AssertionError("the payload was read")
+    class Unread:
+        def __len__(self) -> int:
+            return LARGEST_COMMAND_BYTES + 1
 
-    text, reason = CommandIntake(Clock()).read(LARGEST_COMMAND_BYTES + 1, payload)
+        def to_bytes(self) -> bytes:
+            raise AssertionError("the payload was read")
+
+    text, reason = CommandIntake(Clock()).read(Unread())
     assert text is None
     assert f"{LARGEST_COMMAND_BYTES + 1} bytes" in reason
 

@@ -51,12 +51,16 @@ class Loop:
 
 
 class Payload:
-    """A payload that counts its copies."""
+    """A payload that counts its copies. `size`: as it states itself."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes, size: int | None = None) -> None:
         self.data, self.copies = data, 0
+        self.size = len(data) if size is None else size
 
-    def copy(self) -> bytes:
+    def __len__(self) -> int:
+        return self.size
+
+    def to_bytes(self) -> bytes:
         self.copies += 1
         return self.data
 
@@ -138,14 +142,14 @@ def test_bad_message_is_counted_and_reported_once(name: str) -> None:
         loop, payload = Loop(), Payload(data)
         queue = loop.queue(listener)
         for _ in range(5):
-            queue.offer(len(data), payload.copy, 6 * NS)
+            queue.offer(payload, 6 * NS)
             loop.run()
         assert queue.ignored == 5, kind
         assert [level for level, _ in loop.events] == ["warning"], kind
         assert "\n" not in loop.events[0][1], kind
         assert len(loop.events[0][1]) < 300, kind
         loop.now_s += WARN_INTERVAL_S
-        queue.offer(len(data), payload.copy, 6 * NS)
+        queue.offer(payload, 6 * NS)
         loop.run()
         assert len(loop.events) == 2, kind
 
@@ -154,9 +158,9 @@ def test_bad_message_is_counted_and_reported_once(name: str) -> None:
 def test_too_large_message_is_never_copied_or_scheduled(name: str) -> None:
     loop = Loop()
     queue = loop.queue(service_listeners()[name])
-    payload = Payload(b"")
+    payload = Payload(b"", 90 * MIB)
     for _ in range(1000):
-        queue.offer(90 * MIB, payload.copy, 0)
+        queue.offer(payload, 0)
     assert payload.copies == 0
     assert queue.ignored == 1000
     loop.turn()  # the line
@@ -168,14 +172,14 @@ def test_flood_is_bounded_and_the_newest_messages_stay() -> None:
     loop = Loop()
     queue = loop.queue(Listener(topics.POSE, lambda data, _: received.append(data)))
     for number in range(MAX_WAITING + 100):
-        queue.offer(4, Payload(b"%04d" % number).copy, number)
+        queue.offer(Payload(b"%04d" % number), number)
     assert len([call for call, _ in loop.calls if call == queue._handle]) == 1
     loop.turn()
     assert len(received) == BATCH  # then the loop's other work has its turn
     loop.run()
     assert received == [b"%04d" % number for number in range(100, MAX_WAITING + 100)]
     assert queue.ignored == 100
-    queue.offer(4, Payload(b"last").copy, 0)
+    queue.offer(Payload(b"last"), 0)
     loop.run()
     assert received[-1] == b"last"
 
@@ -190,7 +194,7 @@ def test_error_of_a_listener_does_not_end_the_next_message() -> None:
     loop = Loop()
     queue = loop.queue(Listener(topics.POSE, receive))
     for data in (b"1", b"2"):
-        queue.offer(1, Payload(data).copy, 0)
+        queue.offer(Payload(data), 0)
     loop.run()
     assert received == [b"1", b"2"]
     assert queue.ignored == 2
@@ -227,7 +231,7 @@ def test_mutated_messages_are_used_or_ignored(name: str) -> None:
         data = bytearray(base)
         for _ in range(numbers.randrange(1, 6)):
             data[numbers.randrange(len(data))] = numbers.randrange(256)
-        queue.offer(len(data), Payload(bytes(data)).copy, 6 * NS)
+        queue.offer(Payload(bytes(data)), 6 * NS)
         loop.run()
     assert queue.ignored > 100
     assert len(loop.events) == 1

@@ -15,10 +15,16 @@ import numpy as np
 import pytest
 
 from companion.bench.lockstep_flight import plain_settings
-from companion.bus.messages import cloud_attachment, depth_image_attachment, detections_message
+from companion.bus.messages import (
+    camera_info_message,
+    cloud_attachment,
+    depth_image_attachment,
+    detections_message,
+)
 from companion.bus.topics import RECORDER_TOPICS, TOPICS
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
+from companion.peer_data import PeerDataError
 from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Recorded
@@ -29,6 +35,7 @@ from companion.recording.tap import run_record
 from companion.settings import ZenohSection
 from companion.settings.reading import load_settings
 from companion.vehicle.state import VehicleState
+from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections
 from vision.pipeline import PerceptionResult
 from vision.point_cloud import PointCloud
@@ -41,17 +48,16 @@ STATE = VehicleState(
     longitude_deg=8.0,
     altitude_amsl_m=500.0,
 )
-CAMERA_INFO = {
-    "stamp_ns": PUBLISHED_NS,
-    "frame_id": "vehicle1/camera",
-    "width": 1920,
-    "height": 1080,
-    "distortion_model": "plumb_bob",
-    "d": [0.0] * 5,
-    "k": [1.0] * 9,
-    "r": [1.0] * 9,
-    "p": [1.0] * 12,
-}
+CAMERA_INFO = dict(
+    camera_info_message(
+        CameraModel.from_horizontal_fov(1920, 1080, 1.2),
+        CameraMount(),
+        calibrated=True,
+        vehicle="vehicle1",
+        view=None,
+        now_ns=PUBLISHED_NS,
+    )
+)
 TRANSFORMS = {
     "captured_ns": CAPTURED_NS,
     "transforms": [
@@ -222,6 +228,25 @@ def test_message_is_kept_and_converted(
     kept, *others = converter.convert(path, dumps(message))
     assert (kept.channel.topic, json.loads(kept.data)) == (path, message)
     assert list(foxglove(iter(others))) == [topic]
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": "wide"}, {"k": [1.0] * 8}, {"d": [0.0] * 10_000}, {"d": None}, {"mount": {}}]
+)
+def test_calibration_that_is_not_of_its_schema_is_refused(
+    converter: Converter, change: dict[str, Any]
+) -> None:
+    with pytest.raises(PeerDataError, match=next(iter(change))):
+        list(converter.convert("camera_info", dumps({**CAMERA_INFO, **change})))
+
+
+@pytest.mark.parametrize("size", [(2**20, 2**20), (-4, -3), (0, 0)])
+def test_depth_image_of_an_impossible_size_is_not_unpacked(
+    converter: Converter, size: tuple[int, int]
+) -> None:
+    about = dumps(depth_image_attachment(7, CAPTURED_NS, None, *size))
+    with pytest.raises(ValueError, match="at most"):
+        list(converter.convert("depth_image", zlib.compress(DEPTH.tobytes()), about))
 
 
 def test_fisheye_has_foxgloves_name(converter: Converter) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -53,6 +54,36 @@ def test_given_values_win_and_conflict_names_both() -> None:
     for value in ("80.0°", "70.0°", "mount_pitch_deg 0 (camera: -20)"):
         assert value in conflict
     assert "forward" not in conflict
+
+
+@pytest.mark.parametrize(
+    ("lens", "mount", "key"),
+    [
+        ((1e-3, 450.0, 320.0, 240.0), {}, "fx_px"),
+        ((450.0, 1e9, 320.0, 240.0), {}, "fy_px"),
+        ((450.0, 450.0, 1e12, 240.0), {}, "cx_px"),
+        ((450.0, 450.0, 320.0, -1e6), {}, "cy_px"),
+        ((450.0, 450.0, 320.0, 240.0), {"down_m": 1e30}, "mount_down_m"),
+        ((450.0, 450.0, 320.0, 240.0), {"forward_m": math.nan}, "mount_forward_m"),
+        ((450.0, 450.0, 320.0, 240.0), {"pitch_rad": 7.0}, "mount_pitch_deg"),
+        ((450.0, 450.0, 320.0, 240.0), {"stabilized": True, "on_gimbal": True}, "on_gimbal"),
+    ],
+)
+def test_calibration_that_no_camera_has_is_refused(
+    lens: tuple[float, float, float, float], mount: dict[str, Any], key: str
+) -> None:
+    calibration = CameraCalibration(CameraModel(640, 480, *lens), CameraMount(**mount))
+    with pytest.raises(ValueError, match=key) as refused:
+        adopt_calibration(section_of(), calibration)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_lens_with_a_number_that_is_not_finite_is_refused(index: int) -> None:
+    numbers = [450.0, 450.0, 320.0, 240.0]
+    numbers[index] = math.nan
+    with pytest.raises(ValueError, match="finite"):
+        CameraModel(640, 480, numbers[0], numbers[1], numbers[2], numbers[3])
 
 
 def test_agreeing_values_are_no_conflict() -> None:
