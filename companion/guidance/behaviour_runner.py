@@ -85,7 +85,8 @@ class BehaviourRunner:
         """Replace the active behaviour by a command's."""
         self.end(Outcome(False, f"replaced by {behaviour.name}"))
         self._note_mode(context.state)
-        self._modes.prepare(context.state)
+        received_ns = context.now_ns if command.received_ns is None else command.received_ns
+        self._modes.prepare(context.state, received_ns)
         self._battery.reset()
         self._begin(behaviour, command)
         self._out.event(EventKind.STARTED, behaviour.name, "started")
@@ -185,6 +186,8 @@ class BehaviourRunner:
 
     def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
         self.behaviour, self._command, self.busy = behaviour, command, busy
+        if command is None:
+            self._modes.decide_alone()
         self._activated, self._position_lost_ns = False, None
         self._setpoints.begin()
         self.active, self._landing, self.gimbal_user = None, False, ""
@@ -226,6 +229,8 @@ class BehaviourRunner:
             case _:
                 got = type(step).__name__
                 raise TypeError(f"update returned {got}, expected Setpoint, ModeRequest or Outcome")
+        if self._modes.phase not in (Phase.ENGAGING, Phase.REQUESTING):
+            self._modes.decide_alone()  # the command has not caused a request
 
     def _report_reset(
         self, behaviour: Behaviour, before: BehaviourContext | None, context: BehaviourContext

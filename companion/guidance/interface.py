@@ -73,12 +73,22 @@ class ReleaseGimbal:
 Action = SetMode | Arm | Disarm | TakeOff | FindGimbal | TakeGimbal | PointGimbal | ReleaseGimbal
 
 
+# How long a request may be sent or repeated: after guidance's decision (a take-off waits up to 3 s for home),
+# and what the operator's command directly causes after its reception. The longest waits of a command: 4 s for
+# the gimbal, home or detections, 3 s for each of hold, pre-arm checks, arming and home.
+REQUEST_VALID_S, COMMAND_VALID_S = 8.0, 15.0
+
+
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request to the vehicle. It is answered once, by an `Answer` with the same identifier."""
+    """A request to the vehicle. It is answered once, by an `Answer` with the same identifier.
+
+    `valid_until_ns`: it is not sent or repeated after that, CLOCK_MONOTONIC nanoseconds.
+    """
 
     identifier: int
     action: Action
+    valid_until_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +125,7 @@ class CommandInput:
         mode_changes: `GuidanceInput.mode_changes` when the command was given; None: not known. A later
             change of mode or arming supersedes the command.
         source: None where the behaviour was not built from a text.
+        received_ns: when it was given; None: in the step that takes it.
     """
 
     identifier: int
@@ -124,6 +135,7 @@ class CommandInput:
     endless: bool = False
     mode_changes: int | None = None
     source: CommandSource | None = None
+    received_ns: int | None = None
 
     def __post_init__(self) -> None:
         if (self.behaviour is None) == (self.aim is None):
@@ -265,10 +277,17 @@ class OutputCollector:
         self.now_ns = now_ns
         self.requests, self.cancelled, self.events, self.results = [], [], [], []
 
-    def request(self, action: Action) -> int:
-        """Add a request; returns its identifier."""
+    def request(self, action: Action, commanded_ns: int | None = None) -> int:
+        """Add a request; returns its identifier.
+
+        Args:
+            commanded_ns: reception of the command that directly causes it; None: guidance's own decision.
+        """
+        until_ns = self.now_ns + round(REQUEST_VALID_S * 1e9)
+        if commanded_ns is not None:
+            until_ns = min(until_ns, commanded_ns + round(COMMAND_VALID_S * 1e9))
         self._identifier += 1
-        self.requests.append(Request(self._identifier, action))
+        self.requests.append(Request(self._identifier, action, until_ns))
         return self._identifier
 
     def cancel(self, identifier: int) -> None:

@@ -58,6 +58,7 @@ class ModeControl:
         self._yielded: tuple[int, str] | None = None
         self._armed_on_ground = False
         self._disarm: int | None = None
+        self._commanded_ns: int | None = None
 
     @property
     def yielded(self) -> str | None:
@@ -69,8 +70,11 @@ class ModeControl:
         """Whether we have armed the vehicle, and it has not taken off since."""
         return self._armed_on_ground
 
-    def prepare(self, state: VehicleState) -> None:
-        """A command begins: take command of the vehicle, or drop the autopilot mode of the one before."""
+    def prepare(self, state: VehicleState, received_ns: int) -> None:
+        """A command begins: take command of the vehicle, or drop the autopilot mode of the one before.
+
+        `received_ns`: of the command; its first request is not sent long after that.
+        """
         if self._disarm is not None:
             self._out.cancel(self._disarm)
             self._disarm = None
@@ -81,6 +85,11 @@ class ModeControl:
             self.drop_request()
         elif self.phase is Phase.DELEGATED:
             self.phase, self.requested = Phase.READY, None
+        self._commanded_ns = received_ns
+
+    def decide_alone(self) -> None:
+        """What is requested from now on is guidance's own decision, not directly caused by a command."""
+        self._commanded_ns = None
 
     def lost(
         self, context: BehaviourContext, inputs: GuidanceInput, paused_s: float, *, landing: bool
@@ -135,7 +144,7 @@ class ModeControl:
         if self.request is not None:
             return None
         if sent_count - self._sent_before_engaging >= SETPOINTS_BEFORE_OFFBOARD:
-            self.request = self._out.request(SetMode(FlightMode.OFFBOARD))
+            self.request = self._out.request(SetMode(FlightMode.OFFBOARD), self._commanded_ns)
         elif context.now_ns - self._engaging_since_ns > ENGAGE_TIMEOUT_S * 1e9:
             return f"offboard not requested: no setpoint sent within {ENGAGE_TIMEOUT_S:g} s"
         return None
@@ -153,18 +162,18 @@ class ModeControl:
         if self._sequence is not None and self.request is None:
             action = self._sequence.next(context.now_ns, context.state)
             if action is not None:
-                self.request = self._out.request(action)
+                self.request = self._out.request(action, self._commanded_ns)
                 self._armed_on_ground |= isinstance(action, Arm)
 
     def take_answer(self, answer: Answer, now_ns: int) -> str | None:
         """Handle the answer to the pending request. Returns why it failed; None: it did not."""
         self.request = None
         if answer.refused is not None:
-            self._sequence = None
+            self._sequence = self._commanded_ns = None
             return answer.refused
         if self._sequence is not None and not self._sequence.finished:
             return None
-        self._sequence = None
+        self._sequence = self._commanded_ns = None
         self._authority.settled(now_ns)
         if self.phase is Phase.ENGAGING:
             self.phase = Phase.OFFBOARD
@@ -195,6 +204,7 @@ class ModeControl:
             self._out.cancel(self.request)
             self.request = None
         if pending:
+            self._commanded_ns = None
             self._authority.dropped(self._out.now_ns)
         if self.phase in (Phase.REQUESTING, Phase.DELEGATED):
             self.phase = Phase.READY
@@ -209,7 +219,7 @@ class ModeControl:
         if ended_in is not None and self._armed_on_ground and ended_in.armed:
             self._disarm = self._out.request(Disarm())
         self._armed_on_ground = False
-        self._yielded = None
+        self._yielded = self._commanded_ns = None
         self.drop_request()
         self._setpoints.stop()
         self._authority.release()

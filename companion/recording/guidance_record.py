@@ -36,6 +36,7 @@ class RecordedCommand:
     endless: bool
     mode_changes: int | None
     source: CommandSource | None
+    received_ns: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,7 @@ def input_record(step: int, now_ns: int, context: StepContext, inputs: GuidanceI
             command.endless,
             command.mode_changes,
             command.source,
+            command.received_ns,
         )
         for command in inputs.commands
     )
@@ -131,4 +133,5 @@ def _command(
         recorded.endless,
         recorded.mode_changes,
         source,
+        recorded.received_ns,
     )

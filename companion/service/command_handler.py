@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+import time
 from collections.abc import Awaitable, Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from typing import Any
 
 from companion.bus.command_intake import Allowance
@@ -63,6 +64,7 @@ class CommandHandler:
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command and return its result. See `Service.command`."""
+        received_ns = time.monotonic_ns()  # a file is read for up to `READING_S`
         try:
             command = await self._parse(next(self._identifiers), text)
         except GrammarError as error:
@@ -70,6 +72,7 @@ class CommandHandler:
             return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
         if isinstance(command, Select):
             return await self._select_object(command)
+        command = replace(command, received_ns=received_ns)
         is_stop = isinstance(command.behaviour, StopBehaviour)
         reported = (self._stops_reported if is_stop else self._reported).take()
         if reported:

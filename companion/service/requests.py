@@ -30,9 +30,6 @@ from vision.path_planner import PathRequest
 
 logger = logging.getLogger(__name__)
 
-# How long after guidance's decision a request may be sent or repeated: a take-off waits up to 3 s for home.
-VALID_NS = 8_000_000_000
-
 
 def apply_output(
     output: GuidanceOutput,
@@ -78,8 +75,7 @@ class RequestRunner:
     def start(self, request: Request) -> None:
         """Start a request."""
         # Of the step that has decided it: a report, or a standstill, may come before the task begins.
-        since, until_ns = self._driver.state, self._driver.watch.now_ns() + VALID_NS
-        task = spawn(self._run(request, since, until_ns), f"request {request.action}")
+        task = spawn(self._run(request, self._driver.state), f"request {request.action}")
         self._tasks[request.identifier] = task
         if isinstance(request.action, SetMode | Arm | Disarm | TakeOff):
             self._motion.add(request.identifier)
@@ -119,11 +115,11 @@ class RequestRunner:
             self.cancel(identifier)
         await asyncio.gather(*tasks, return_exceptions=True)
 
-    async def _run(self, request: Request, since: VehicleState, until_ns: int) -> None:
+    async def _run(self, request: Request, since: VehicleState) -> None:
         refused: str | None = None
         taken_over = False
         try:
-            refused = await self._execute(request.action, since, until_ns)
+            refused = await self._execute(request.action, since, request.valid_until_ns)
         except (CommandRefusedError, LinkError) as error:
             refused = str(error) or type(error).__name__
             taken_over = isinstance(error, TakenOverError)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from typing import Any
 
 import pytest
@@ -64,6 +65,29 @@ async def flooded() -> Handler:
 def line_after_flood(text: str) -> str:
     """Of a command that superseded another; `companion.language.control` reads exactly this."""
     return f"command: {text} ({FLOOD - REPORTED_AT_ONCE + 1} before it not logged)"
+
+
+async def test_validity_counts_from_the_reception_of_the_command() -> None:
+    """Before the text is read: a mission's file may take seconds."""
+    read_ns: list[int] = []
+
+    def read(identifier: int, text: str) -> CommandInput:
+        while time.monotonic_ns() - given_ns < 20_000_000:
+            pass
+        read_ns.append(time.monotonic_ns())
+        return CommandInput(identifier, text, HoldBehaviour())
+
+    handler = CommandHandler(
+        read, no_selection, lambda: None, lambda *event: None, check_requirements=lambda command: None
+    )
+    given_ns = time.monotonic_ns()
+    answer = asyncio.create_task(handler.execute("mission demo"))
+    while not (commands := handler.take_commands()):
+        await asyncio.sleep(0)
+    assert commands[0].received_ns is not None
+    assert given_ns <= commands[0].received_ns <= read_ns[0] - 10_000_000
+    handler.on_result(CommandResult(commands[0].identifier, Outcome(True, "done")))
+    await answer
 
 
 async def test_flood_of_refused_commands_is_answered_but_not_logged() -> None:

@@ -11,6 +11,8 @@ from companion.service.requests import RequestRunner
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import FlightMode, VehicleState
 
+UNTIL_NS = 2**62
+
 
 class FakeDriver:
     """Raises a given exception, or waits forever."""
@@ -21,6 +23,7 @@ class FakeDriver:
         self.fault = fault
         self.watch = StandstillWatch()
         self.asked: list[str] = []
+        self.until_ns = 0
 
     async def set_mode(self, mode: FlightMode, *, since: VehicleState, valid_until_ns: int) -> None:
         self.asked.append(mode.value)
@@ -30,6 +33,7 @@ class FakeDriver:
 
     async def arm(self, *, since: VehicleState, valid_until_ns: int) -> None:
         self.asked.append("arm")
+        self.until_ns = valid_until_ns
 
     async def find_gimbal(self) -> bool:
         return False
@@ -52,25 +56,31 @@ async def failure_of(driver: FakeDriver, request: Request) -> str | None:
 
 
 async def test_request_is_answered_with_its_result() -> None:
-    hold = Request(7, SetMode(FlightMode.HOLD))
-    assert await failure_of(FakeDriver(), Request(1, Arm())) is None
+    hold = Request(7, SetMode(FlightMode.HOLD), UNTIL_NS)
+    assert await failure_of(FakeDriver(), Request(1, Arm(), UNTIL_NS)) is None
     assert await failure_of(FakeDriver(CommandRefusedError("denied")), hold) == "denied"
     assert await failure_of(FakeDriver(ZeroDivisionError("a bug")), hold) == "ZeroDivisionError: a bug"
-    refused = await failure_of(FakeDriver(), Request(2, FindGimbal()))
+    refused = await failure_of(FakeDriver(), Request(2, FindGimbal(), UNTIL_NS))
     assert refused is not None
     assert refused.startswith("gimbal manager ")
     assert "not responding" in refused
 
 
+async def test_driver_gets_the_validity_of_the_request() -> None:
+    driver = FakeDriver()
+    await failure_of(driver, Request(1, Arm(), 1234))
+    assert driver.until_ns == 1234
+
+
 async def test_internal_cancellation_is_answered() -> None:
-    hold = Request(7, SetMode(FlightMode.HOLD))
+    hold = Request(7, SetMode(FlightMode.HOLD), UNTIL_NS)
     assert "was cancelled" in (await failure_of(FakeDriver(asyncio.CancelledError()), hold) or "")
 
 
 async def test_cancelled_request_is_not_answered() -> None:
     driver = FakeDriver()
     runner, answered = runner_of(driver)
-    runner.start(Request(7, SetMode(FlightMode.HOLD)))
+    runner.start(Request(7, SetMode(FlightMode.HOLD), UNTIL_NS))
     while not driver.asked:
         await asyncio.sleep(0)
     runner.cancel(7)
@@ -82,9 +92,9 @@ async def test_cancelled_request_is_not_answered() -> None:
 async def test_requests_that_move_are_abandoned_with_an_answer() -> None:
     driver = FakeDriver()
     runner, _ = runner_of(driver)
-    runner.start(Request(7, SetMode(FlightMode.OFFBOARD)))
-    runner.start(Request(8, FindGimbal()))
-    runner.start(Request(9, Arm()))  # has not begun yet
+    runner.start(Request(7, SetMode(FlightMode.OFFBOARD), UNTIL_NS))
+    runner.start(Request(8, FindGimbal(), UNTIL_NS))
+    runner.start(Request(9, Arm(), UNTIL_NS))  # has not begun yet
     runner.abandon_motion("suspended")
     await asyncio.sleep(0)
     await runner.close()
