@@ -208,6 +208,8 @@ class PerceptionReplay:
     def _add_samples(self, recorded: RecordedStep) -> None:
         """Let the tracker and ranging know the vehicle's attitudes, as `WorkerCamera.send_state` does."""
         samples = recorded.context.samples
+        if recorded.inputs.standstill is not None:
+            self._history.discard()
         self._history.extend(samples)
         for stamp_ns, attitude in samples.attitudes:
             if self._limiters[0].due(stamp_ns):

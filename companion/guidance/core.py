@@ -242,7 +242,7 @@ class Guidance:
         self._queue.supersede(f"an event ({standstill.why})", self._out)
         self._runner.end_after_standstill(standstill.why)
         self._tracks = RecentTracks(max_age_s=self._options.track_max_age_s)
-        if standstill.long:
+        if standstill.long or standstill.suspended:
             self._standstill = standstill
             self._refuse_until_ns = now_ns + round(standstill.late_commands_s * 1e9)
 

@@ -156,6 +156,11 @@ class PerceptionCamera:
             # Without an attitude at the capture a box has no direction: it is published, but not a target.
             self.targets, self.localization_error = (), str(error)
 
+    def on_path(self, planned: PlannedPath) -> None:
+        """Set the newest path, unless its depth is from before a standstill."""
+        if planned.captured_ns >= self._valid_from_ns:
+            self.planned = planned
+
     async def select(self, request: SelectRequest) -> Selected:
         """Select an object in this camera's images."""
         return Selected(False, "this camera has no perception process")
@@ -215,7 +220,7 @@ class WorkerCamera(PerceptionCamera):
             on_event=self._event,
             on_preview=lambda preview: on_preview(self, preview),
             on_calibration=self._adopt,
-            on_path=self._on_path,
+            on_path=self.on_path,
             record_as=record_as,
         )
 
@@ -269,9 +274,6 @@ class WorkerCamera(PerceptionCamera):
     def request_path(self, request: PathRequest) -> None:
         super().request_path(request)
         self.supervisor.request_path(request)
-
-    def _on_path(self, planned: PlannedPath) -> None:
-        self.planned = planned
 
     def _on_report(self, result: PerceptionResult) -> None:
         self.update(result)

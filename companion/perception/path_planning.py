@@ -6,6 +6,7 @@ import bisect
 from collections import deque
 from collections.abc import Callable
 
+from companion.clock import StandstillWatch
 from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
@@ -37,6 +38,10 @@ class PositionHistory:
         while stamp_ns - self._samples[0][0] > HISTORY_NS:
             self._samples.popleft()
 
+    def discard(self) -> None:
+        """Forget every sample."""
+        self._samples.clear()
+
     @property
     def newest(self) -> Vector3 | None:
         """The newest position; None before the first."""
@@ -66,6 +71,7 @@ class PathPlanning:
         camera_of: the camera's model for an image size.
         height_m: the vehicle's height above home; None: unknown.
         in_flight: whether the vehicle flies.
+        watch: for a suspend of the computer; None: a new one.
 
     Attributes:
         grid: around the vehicle.
@@ -78,6 +84,7 @@ class PathPlanning:
         camera_of: Callable[[int, int], CameraModel],
         height_m: Callable[[], float | None],
         in_flight: Callable[[], bool] = lambda: False,
+        watch: StandstillWatch | None = None,
     ) -> None:
         self.grid = OccupancyGrid()
         self._positions, self._pose_at = positions, pose_at
@@ -85,6 +92,7 @@ class PathPlanning:
         self._request: tuple[PathRequest, int] | None = None
         self._newest: PlannedPath | None = None
         self._due_ns = 0
+        self._watch = watch or StandstillWatch()
 
     def request(self, request: PathRequest, now_ns: int) -> None:
         """Set what to plan from now on; it must be repeated."""
@@ -94,7 +102,14 @@ class PathPlanning:
         """Add a frame's depth and plan; None: nothing is requested or due, or depth or pose is missing.
 
         In flight, depth that repeats that of the frame before is none: by this frame's pose it is misplaced.
+        After a suspend of the computer the map begins again: its ages do not count the suspend.
         """
+        seen = self._watch.observe()
+        self._watch.acknowledge(seen)
+        self._watch.end_of_loop()  # a camera may pause
+        if seen.standstill is not None:
+            self.grid, self._request, self._newest = OccupancyGrid(), None, None
+            self._positions.discard()
         if frame.depth_m is None:
             return None
         if frame.depth_since_ns not in (None, frame.captured_ns) and self._in_flight():

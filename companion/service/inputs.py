@@ -137,6 +137,7 @@ class InputAssembler:
 
     def discard_received(self, now_ns: int) -> None:
         """The computer stood still until now: images, poses and velocities from before are outdated."""
+        self.history.discard()
         for camera in self._cameras.values():
             camera.discard_received(now_ns)
         self._markers.discard_received()

@@ -133,6 +133,11 @@ class StateHistory:
             self._gimbal.append((gimbal.attitude_ns, (gimbal.attitude, gimbal.yaw_frame)))
             self._forget(self._gimbal)
 
+    def discard(self) -> None:
+        """The clock of the stamps stood still: between the last sample and the next one anything happened."""
+        for samples in (self._attitudes, self._positions, self._gimbal):
+            samples.clear()
+
     def take_new(self) -> HistorySamples:
         """Return the samples added since the last call, for one caller: a recording."""
         attitude_ns, position_ns, gimbal_ns = self._taken_ns

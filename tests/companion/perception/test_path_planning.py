@@ -11,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from companion.clock import StandstillWatch
 from companion.perception.path_planning import PathPlanning, PositionHistory
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.settings.reading import load_settings
@@ -86,6 +87,30 @@ def test_nothing_is_planned_without_a_recent_request_or_pose() -> None:
     nowhere = planning_at(None)
     nowhere.request(REQUEST, TENTH_NS)
     assert nowhere.update(pillar(1), TENTH_NS) is None
+
+
+def test_map_begins_again_after_a_suspend() -> None:
+    suspended_ns, now_ns = [0], [TENTH_NS]
+    positions = PositionHistory()
+    positions.add(1, POSITION)
+    planning = PathPlanning(
+        positions,
+        lambda stamp_ns: (CameraMount(), np.eye(3)),
+        lambda width, height: CAMERA,
+        lambda: 3.0,
+        watch=StandstillWatch(lambda: now_ns[0] + suspended_ns[0], lambda: now_ns[0]),
+    )
+    planning.request(REQUEST, TENTH_NS)
+    grid = planning.grid
+    assert planning.update(pillar(1), now_ns[0]) is not None
+    now_ns[0] += 5_000_000_000  # the camera paused
+    planning.update(pillar(2), now_ns[0])
+    assert planning.grid is grid
+    suspended_ns[0] = 30_000_000_000
+    planning.request(REQUEST, now_ns[0])
+    assert planning.update(pillar(3), now_ns[0]) is None
+    assert planning.grid is not grid
+    assert positions.newest is None
 
 
 @pytest.mark.parametrize(("rate_hz", "least", "most"), [(6.0, 11, 13), (10.0, 19, 21), (30.0, 19, 21)])
