@@ -205,8 +205,8 @@ class GuidanceInput:
         neighbourhood: the other vehicles; None: poses are not shared.
         ranging: which means of range estimation are available.
         class_names: the detector's classes; None: not known, so not checked.
-        mode_changes: how often mode or armed changed since the link opened, including a change that was
-            reverted between two steps.
+        mode_changes: how often the reported number of the mode, or armed, changed since the link opened,
+            including a change that was reverted between two steps.
         answers: to requests of earlier steps. commands: the new ones, oldest first.
         ending: the service ends: no command begins, and control is released.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.

@@ -30,7 +30,7 @@ from companion.service.autopilot_reports import AutopilotReports
 from companion.service.velocity_senders import VelocitySenders
 from companion.settings import CameraSection, Settings
 from companion.vehicle.autopilot_parameters import NOTHING_READ
-from companion.vehicle.state import FlightMode, VehicleState
+from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
 from vision.tracking import Selected
 
@@ -70,7 +70,7 @@ class InputAssembler:
         self.parameters = NOTHING_READ
         self._markers = MarkerTracker(cameras, on_event)
         self._state: VehicleState | None = None
-        self._shown: tuple[FlightMode, bool] | None = None
+        self._shown: tuple[int, bool] | None = None
         self._mode_changes = 0
         self._on_event = on_event
         self._reports = AutopilotReports(on_event)
@@ -81,8 +81,9 @@ class InputAssembler:
     def on_state(self, state: VehicleState) -> None:
         """Process a new snapshot of the vehicle."""
         self._reports.update(state)
-        if (state.mode, state.armed) != self._shown:
-            self._shown = (state.mode, state.armed)
+        # By its number: modes without a name here differ too, and a name of ours is not a change.
+        if (state.custom_mode, state.armed) != self._shown:
+            self._shown = (state.custom_mode, state.armed)
             self._mode_changes += 1
         self._state = state
         for camera in self._cameras.values():
