@@ -39,6 +39,8 @@ from companion.vehicle.mode_changes import (
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.report_reader import Event, EventCatalogue
 from companion.vehicle.setpoint import Setpoint, setpoint_fields
+from companion.vehicle.setpoint_echo import NAME as ECHO_NAME
+from companion.vehicle.setpoint_echo import SetpointEcho
 from companion.vehicle.state import VehicleState
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, apply_message
 from companion.vehicle.telemetry_state import REPORTS_KEPT
@@ -139,6 +141,7 @@ class SimulatedDriver:
             self._on_restored,
         )
         self._changing: dict[int, ModeChange] = {}
+        self._echo = SetpointEcho()
         self._timesyncs_ns: deque[int] = deque(maxlen=TIMESYNCS_KEPT)
         self._answered_ns = 0
         self._pending: list[_Pending] = []
@@ -174,6 +177,7 @@ class SimulatedDriver:
     def send_setpoint(self, setpoint: Setpoint) -> None:
         moved = setpoint.moved(self._state.reset_offset_ned_m)
         fields = self._profile.setpoint_fields(setpoint_fields(moved, self.vehicle.vehicle.system_id))
+        self._echo.sent(fields, self.now_ns)
         self.vehicle.send(dialect.MAVLink_set_position_target_local_ned_message(**fields))
 
     def send_landing_target(self, target: LandingTarget) -> None:
@@ -265,10 +269,13 @@ class SimulatedDriver:
                 self._answered_ns = max(self._answered_ns, message.ts1)
             elif name == "EVENT":
                 self._on_event(message, now_ns)
+            elif name == ECHO_NAME:
+                self._echo.received(message.to_dict(), self._state, now_ns, self._answered_ns)
             elif name in TELEMETRY_MESSAGES or self._kind == ARDUPILOT:
                 for name_now, fields in self._profile.translate(name, message.to_dict(), self._state):
                     self._state = apply_message(self._state, name_now, fields, now_ns)
                     if name_now in ("HEARTBEAT", "CURRENT_MODE"):
+                        self._state = self._echo.confirm(self._state, now_ns)
                         self._changes.on_report(self._state, now_ns, self._answered_ns)
         state = self._state
         if state.ready_to_arm and state.home_fault() is not None and not self._home_requested:
@@ -284,12 +291,12 @@ class SimulatedDriver:
         self._follow_changes(now_ns)
 
     def _follow_changes(self, now_ns: int) -> None:
-        """As `flight_commands` follows them, with a TIMESYNC every half second meanwhile."""
-        if not self._changing and not self._changes.pending:
-            return
+        """As `flight_commands` follows them, with a TIMESYNC every half second."""
         if not self._timesyncs_ns or now_ns - self._timesyncs_ns[-1] >= TIMESYNC_PERIOD_NS:
             self._timesyncs_ns.append(now_ns)
             self.vehicle.send(dialect.MAVLink_timesync_message(0, now_ns))
+        if not self._changing and not self._changes.pending:
+            return
         self._changes.tick(now_ns)
         for identifier, change in list(self._changing.items()):
             if change.ending is None:

@@ -128,7 +128,13 @@ class Health:
                 uptime_s=self._others.uptime_s(now_ns),
                 in_command=guidance.in_command,
             )
-            self._others.watch(self._driver.state, now_ns, self.silence, in_command=guidance.in_command)
+            self._others.watch(
+                self._driver.state,
+                now_ns,
+                self.silence,
+                in_command=guidance.in_command,
+                exact_echo=self._inputs.parameters.exact_echo,
+            )
             self._notifier.alive()
         if now_ns >= self._hud_due_ns:
             self._hud_due_ns = now_ns + round(HUD_PERIOD_S * 1e9)

@@ -5,8 +5,8 @@ detected by its HEARTBEAT, which the autopilot forwards from its other links (`v
 its `status` under the same name on the network. The one with the longer uptime may engage; the other refuses.
 
 Any program that commands the vehicle is also detected by its effect: an acknowledgement, to our address, of a
-command that we did not send; on PX4 also OFFBOARD, which it leaves without setpoints, while we send none. Not
-where its parameters let it stay there.
+command that we did not send; setpoints that the autopilot follows beside ours (`setpoint_echo`); on PX4 also
+OFFBOARD, which it leaves without setpoints, while we send none. Not where its parameters let it stay there.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from companion.vehicle.state import FlightMode, VehicleState
 
 FOREIGN_COMMAND = "commands with our own address"
 FOREIGN_OFFBOARD = "setpoints in OFFBOARD"
+FOREIGN_SETPOINTS = "setpoints beside ours"
 # Heartbeats and `status` are sent once a second.
 GONE_AFTER_S = 3.5
 # Uptimes are whole seconds, and delayed: of two services started this close together neither is the first.
@@ -43,6 +44,7 @@ class _Other:
     Attributes:
         via: "mavlink" or "zenoh". identity: its MAVLink address, or `service` of its `status`.
         started_ns: CLOCK_MONOTONIC, from its uptime.
+        effect: what it does to the vehicle, as text; empty: not known.
     """
 
     via: str
@@ -50,12 +52,13 @@ class _Other:
     received_ns: int
     started_ns: int
     in_command: bool
+    effect: str = ""
 
     @property
     def text(self) -> str:
         """Description for the operator."""
         state = "in command" if self.in_command else "not in command"
-        return f"{self.identity} by {self.via}, {state}"
+        return f"{self.identity} by {self.via}, {state}{self.effect and f': {self.effect}'}"
 
 
 class OtherCommanders:
@@ -78,6 +81,7 @@ class OtherCommanders:
         self._shared = False
         self._offboard_since_ns: int | None = None
         self._foreign_after_s = FOREIGN_OFFBOARD_S
+        self._exact_echo = False
 
     def uptime_s(self, now_ns: int) -> float:
         """Uptime of this service, seconds."""
@@ -126,6 +130,10 @@ class OtherCommanders:
             found.append(_Other("mavlink", FOREIGN_COMMAND, commanded_ns, commanded_ns, True))
         if since_ns is not None and now_ns - since_ns >= self._foreign_after_s * 1e9:
             found.append(_Other("mavlink", FOREIGN_OFFBOARD, now_ns, since_ns, True))
+        beside = state.foreign_setpoint
+        if self._exact_echo and beside is not None and _is_recent(beside.stamp_ns, now_ns):
+            effect = f"the autopilot follows {beside.followed} beside our {beside.sent}"
+            found.append(_Other("mavlink", FOREIGN_SETPOINTS, beside.stamp_ns, beside.since_ns, True, effect))
         return found
 
     def shares_address(self, state: VehicleState, now_ns: int) -> bool:
@@ -133,15 +141,23 @@ class OtherCommanders:
         return state.address_shared_ns > 0 and _is_recent(state.address_shared_ns, now_ns)
 
     def watch(
-        self, state: VehicleState, now_ns: int, silence: SilenceOutcome, *, in_command: bool = False
+        self,
+        state: VehicleState,
+        now_ns: int,
+        silence: SilenceOutcome,
+        *,
+        in_command: bool = False,
+        exact_echo: bool = False,
     ) -> None:
         """Report services that have appeared or disappeared, once each; call it once a second.
 
         Args:
             silence: what the autopilot does without setpoints.
             in_command: whether we are in command.
+            exact_echo: whether the autopilot reports the setpoint that it follows as it was sent.
         """
         self._watch_address(state, now_ns)
+        self._exact_echo = exact_echo
         self._foreign_after_s = max(FOREIGN_OFFBOARD_S, (silence.after_s or 0.0) + LOSS_MARGIN_S)
         flies_setpoints = state.autopilot == "PX4" and state.mode is FlightMode.OFFBOARD and state.armed
         if silence.effect is SilenceEffect.FLY_ON:  # in OFFBOARD it stays there without setpoints too

@@ -27,7 +27,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from companion.vehicle.autopilot_profile import DISTANCE_SENSOR_ID, HOME_POSITION_ID, AutopilotProfile
+from companion.vehicle.autopilot_profile import (
+    DISTANCE_SENSOR_ID,
+    HOME_POSITION_ID,
+    POSITION_TARGET_HZ,
+    POSITION_TARGET_ID,
+    AutopilotProfile,
+)
 from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID
 from companion.vehicle.setpoint import IGNORE_ACCELERATION, IGNORE_YAW, IGNORE_YAW_RATE
@@ -90,6 +96,7 @@ class ArduPilotProfile(AutopilotProfile):
         GPS_GLOBAL_ORIGIN_ID: 0.5,
         EKF_STATUS_REPORT_ID: 5.0,
         DISTANCE_SENSOR_ID: 10.0,
+        POSITION_TARGET_ID: POSITION_TARGET_HZ,
     }
     optional = (EKF_STATUS_REPORT_ID,)
 

@@ -21,7 +21,7 @@ from typing import Any
 from companion.clock import StandstillWatch
 from companion.tasks import spawn
 from companion.vehicle.autopilot_parameters import FirmwareVersion
-from companion.vehicle.autopilot_profile import AutopilotProfile, Px4Profile
+from companion.vehicle.autopilot_profile import POSITION_TARGET_ID, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
@@ -39,6 +39,7 @@ from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.own_address import LISTEN_JITTER_S, LISTEN_S, OwnAddress
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
+from companion.vehicle.setpoint_echo import NAME as ECHO_NAME
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.stream_requests import StreamRequests
@@ -69,6 +70,8 @@ _TIMESYNC_ID = 111
 _SYSTEM_TIME_ID = 2
 _SYSTEM_TIME = struct.Struct("<QI")  # time_unix_usec, time_boot_ms
 _SETPOINT_ID = 84  # SET_POSITION_TARGET_LOCAL_NED
+# POSITION_TARGET_LOCAL_NED: time_boot_ms, position, velocity, acceleration, yaw and its rate, mask, frame
+_POSITION_TARGET = struct.Struct("<I11fHB")
 _AUTOPILOT_VERSION_ID = 148
 _AUTOPILOT_VERSION = struct.Struct("<QQI")  # capabilities, uid, flight_sw_version; the rest is not read
 _REQUEST_MESSAGE = 512
@@ -372,6 +375,9 @@ class AutopilotDriver(ABC):
                     elif frame.message_id == EXTENDED_SYS_STATE_ID:
                         self._extended_sys_state_from(frame)
                         continue
+                    elif frame.message_id == POSITION_TARGET_ID:
+                        self._position_target_from(frame)
+                        continue
                     elif frame.message_id == _COMMAND_ACK_ID:
                         self._acknowledgement_from(frame)
                     elif self._reports.on_frame(frame):
@@ -449,6 +455,13 @@ class AutopilotDriver(ABC):
             vtol_state, landed_state = frame.padded(2)
             fields = {"vtol_state": vtol_state, "landed_state": landed_state}
             self._telemetry.handle("EXTENDED_SYS_STATE", fields)
+
+    def _position_target_from(self, frame: Frame) -> None:
+        """Apply a POSITION_TARGET_LOCAL_NED here: its order among the reports of the mode counts."""
+        if self._autopilot_kind in self.supported_autopilots:
+            _, *values, mask, _ = _POSITION_TARGET.unpack(frame.padded(_POSITION_TARGET.size))
+            named = zip(("x", "y", "z", "vx", "vy", "vz"), values, strict=False)
+            self._telemetry.handle(ECHO_NAME, {"type_mask": mask, **dict(named)})
 
     def _acknowledgement_from(self, frame: Frame) -> None:
         """Apply a COMMAND_ACK here: its order among the reports of the mode counts (`mode_changes`).
@@ -614,6 +627,7 @@ class AutopilotDriver(ABC):
             return
         setpoint = setpoint.moved(self._telemetry.state.reset_offset_ned_m)
         fields = setpoint_fields(setpoint, self._system_id, stamp_ms)
+        self._telemetry.echo.sent(fields, time.monotonic_ns())
         self._send_message("SET_POSITION_TARGET_LOCAL_NED", self._telemetry.profile.setpoint_fields(fields))
 
     def send_landing_target(self, target: LandingTarget) -> None:

@@ -18,6 +18,10 @@ DEFAULT_ACCEPTANCE_M = 0.8
 STICKS_DISABLED = 4
 _OFFBOARD_OVERRIDE = 2  # bit of COM_RC_OVERRIDE
 _IGNORE_PILOT_YAW = 4  # bit of GUID_OPTIONS
+_DO_NOT_STABILIZE_VELOCITY = 32  # bit of GUID_OPTIONS: Copter then reports the velocity that it has reached
+# Since then POSITION_TARGET_LOCAL_NED is the setpoint as it was sent. PX4: flown with v1.14.4, v1.16.2 and
+# v1.18.0-beta1. Copter: flown with 4.7; by source since 2021, and not in 4.0.
+_EXACT_ECHO = {"PX4": (1, 14), "ArduPilot": (4, 2)}
 
 PX4_PARAMETERS = (
     "COM_OF_LOSS_T",
@@ -81,6 +85,17 @@ class AutopilotParameters:
     def altitude_acceptance_m(self) -> float | None:
         """How far below its goal PX4 ends a climb (NAV_MC_ALT_RAD); None: not known."""
         return self.get("NAV_MC_ALT_RAD")
+
+    @property
+    def exact_echo(self) -> bool:
+        """Whether the autopilot is known to report the setpoint that it follows as it was sent."""
+        since = _EXACT_ECHO.get(self.autopilot or "")
+        if since is None or self.version is None or (self.version.major, self.version.minor) < since:
+            return False
+        if self.autopilot == "PX4":
+            return True
+        options = self.get("GUID_OPTIONS")
+        return options is not None and not int(options) & _DO_NOT_STABILIZE_VELOCITY
 
     @property
     def sticks_text(self) -> str | None:

@@ -22,6 +22,10 @@ HOME_POSITION_ID = 242
 ESTIMATOR_STATUS_ID = 230
 ODOMETRY_ID = 331
 DISTANCE_SENSOR_ID = 132
+POSITION_TARGET_ID = 85  # POSITION_TARGET_LOCAL_NED
+# Its period, 187 ms, has no factor in common with the usual ones of setpoints (20, 100, 500 ms): with 100 ms,
+# Copter reported 2 of 130 setpoints that another program sent at 2 and 10 Hz.
+POSITION_TARGET_HZ = 1.0 / 0.187
 
 
 class AutopilotProfile(ABC):
@@ -33,8 +37,8 @@ class AutopilotProfile(ABC):
         name: for display. rates_hz: message id → requested rate, Hz, of the messages that are used.
         expected_hz: message id → resulting rate, where it differs from the requested one.
         optional: ids in `rates_hz` that not every version has.
-        once: ids in `rates_hz` of equipment that a vehicle may lack: they are requested once where they are
-            missing, and are not missing afterwards.
+        once: ids in `rates_hz` of equipment that a vehicle may lack, and of what it sends in some modes only:
+            they are requested once where they are missing, and are not missing afterwards.
         requested: ids that are also requested once, while home is unknown.
         parameters_bytewise: integer parameters are sent as their bytes; else as numbers.
         takeoff_needs_home: NAV_TAKEOFF takes an altitude AMSL, which needs home's altitude.
@@ -45,7 +49,7 @@ class AutopilotProfile(ABC):
     rates_hz: dict[int, float]
     expected_hz: Mapping[int, float] = MappingProxyType({})
     optional: tuple[int, ...] = ()
-    once: tuple[int, ...] = (DISTANCE_SENSOR_ID,)
+    once: tuple[int, ...] = (DISTANCE_SENSOR_ID, POSITION_TARGET_ID)
     requested: tuple[int, ...] = (HOME_POSITION_ID,)
     parameters_bytewise: bool
     takeoff_needs_home: bool
@@ -101,6 +105,7 @@ class Px4Profile(AutopilotProfile):
         ESTIMATOR_STATUS_ID: 5.0,
         ODOMETRY_ID: 5.0,  # for its reset_counter
         DISTANCE_SENSOR_ID: 10.0,
+        POSITION_TARGET_ID: POSITION_TARGET_HZ,
     }
     expected_hz = MappingProxyType({CURRENT_MODE_ID: 2.0})  # PX4 repeats it every 0.5 s, not more often
     optional = (CURRENT_MODE_ID, ESTIMATOR_STATUS_ID, ODOMETRY_ID)  # PX4 has CURRENT_MODE since 1.15

@@ -1,4 +1,4 @@
-"""Detects another companion service on the same vehicle by its HEARTBEAT.
+"""Other programs that command the same vehicle; a companion service is detected by its HEARTBEAT.
 
 The type does not identify it: MAVROS, a camera or a logger sends the same type and may have the same
 component id. So this service identifies itself in `custom_mode`, which MAVLink leaves to the sender and no
@@ -40,6 +40,21 @@ class Commander:
     received_ns: int
     uptime_s: float
     in_command: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignSetpoint:
+    """A setpoint of another program, which the autopilot follows at times instead of ours.
+
+    Attributes:
+        stamp_ns: when it was last confirmed. since_ns: the first of those that count. CLOCK_MONOTONIC.
+        sent, followed: ours at that time, and what the autopilot reported to follow, as text.
+    """
+
+    stamp_ns: int
+    since_ns: int
+    sent: str
+    followed: str
 
 
 def commander_mode(uptime_s: float, in_command: bool) -> int:

@@ -15,7 +15,7 @@ from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from companion.vehicle.clock_sync import ClockOffset
-from companion.vehicle.commander import Commander
+from companion.vehicle.commander import Commander, ForeignSetpoint
 from companion.vehicle.gimbal import Address, GimbalState
 from companion.vehicle.ground import GROUND_MAX_AGE_S, GroundLevel
 from companion.vehicle.report import WARNING, Report
@@ -142,6 +142,8 @@ class VehicleState:
         own_address: system and component id of our messages.
         address_shared_ns: when another program last sent with our address, as far as known.
         foreign_command_ns: when the autopilot last acknowledged, to our address, a motion command of another.
+        foreign_setpoint: the newest setpoint of another program that it followed beside ours; None: none.
+        alters_velocities: its fence or proximity sensors are enabled, which alter velocities (ArduPilot).
     """
 
     heartbeat_ns: int = 0
@@ -191,6 +193,8 @@ class VehicleState:
     own_address: Address = (1, 191)
     address_shared_ns: int = 0
     foreign_command_ns: int = 0
+    foreign_setpoint: ForeignSetpoint | None = field(default=None, metadata={"recorded": False})
+    alters_velocities: bool = field(default=False, metadata={"recorded": False})
 
     @property
     def yaw_rad(self) -> float | None:

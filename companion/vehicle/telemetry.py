@@ -19,6 +19,7 @@ _SAFETY_ARMED = 128  # MAV_MODE_FLAG
 _STATE_CRITICAL, _STATE_EMERGENCY = 5, 6  # MAV_STATE
 _PREARM_CHECK = 0x1000_0000  # MAV_SYS_STATUS_PREARM_CHECK
 _RC_RECEIVER = 0x1_0000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER: a remote control or a joystick
+_AVOIDANCE = 0x10_0000 | 0x400_0000  # MAV_SYS_STATUS_GEOFENCE, MAV_SYS_STATUS_SENSOR_PROXIMITY
 _LOCAL_NED = 1  # MAV_FRAME
 # ESTIMATOR_STATUS_FLAGS; EKF_STATUS_REPORT has the same bits. CONST_POS_MODE (128) is not a fault: PX4 sets
 # it at rest with a valid position.
@@ -223,7 +224,9 @@ def _sys_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleStat
     health = fields["onboard_control_sensors_health"]
     ready = bool(health & _PREARM_CHECK)
     sticks = bool(health & fields["onboard_control_sensors_present"] & _RC_RECEIVER)
-    return _battery_status(with_fields(state, ready_to_arm=ready, sticks_present=sticks), fields, now_ns)
+    alters = state.autopilot == "ArduPilot" and bool(fields["onboard_control_sensors_enabled"] & _AVOIDANCE)
+    known = with_fields(state, ready_to_arm=ready, sticks_present=sticks, alters_velocities=alters)
+    return _battery_status(known, fields, now_ns)
 
 
 def _battery_status(state: VehicleState, fields: Fields, now_ns: int) -> VehicleState:

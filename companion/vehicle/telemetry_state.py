@@ -16,6 +16,8 @@ from companion.vehicle.commander import Commander
 from companion.vehicle.gimbal import Address
 from companion.vehicle.gimbal_telemetry import ATTITUDE_STATUS, from_gimbal_device
 from companion.vehicle.report import Report
+from companion.vehicle.setpoint_echo import NAME as ECHO_NAME
+from companion.vehicle.setpoint_echo import SetpointEcho
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, VehicleState
 from companion.vehicle.telemetry import Fields, apply_message
 
@@ -29,7 +31,7 @@ _TWO_CLOCKS_S = 2.0
 _BOOTING = 1  # MAV_STATE_BOOT
 # Messages with the autopilot's clock; TIMESYNC and SYSTEM_TIME are checked by the driver.
 _CLOCKED = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT", "ATTITUDE_QUATERNION")
-_KINEMATIC = (*_CLOCKED, "ODOMETRY", "ESTIMATOR_STATUS", ATTITUDE_STATUS)
+_KINEMATIC = (*_CLOCKED, "ODOMETRY", "ESTIMATOR_STATUS", ATTITUDE_STATUS, ECHO_NAME)
 # PX4 resends this message with the stamp of its first sending, which says nothing about the clock.
 _OLD_STAMPED = "GIMBAL_MANAGER_INFORMATION"
 
@@ -45,6 +47,7 @@ class TelemetryState:
         state: the newest snapshot.
         profile: the profile of the connected autopilot.
         clock: synchronisation of its clock with ours.
+        echo: compares the setpoints that it follows with ours.
         restarted: set when it has restarted; cleared by the link's supervision.
         restart_count: how often it has restarted.
         answered_ns: when the newest answered TIMESYNC request was sent, CLOCK_MONOTONIC.
@@ -70,6 +73,7 @@ class TelemetryState:
         )
         self.profile: AutopilotProfile = Px4Profile()
         self.clock = ClockSync()
+        self.echo = SetpointEcho()
         self.restart_count = self.answered_ns = 0
         self.restarted = asyncio.Event()
         self._boot_ms: dict[str, int] = {}
@@ -101,7 +105,12 @@ class TelemetryState:
             return  # Its sender is ambiguous: the state becomes stale, and what needs it ends.
         stamped = "time_boot_ms" in fields and name != _OLD_STAMPED
         stamp_ns = self.clock.stamp(fields["time_boot_ms"], now_ns) if stamped else now_ns
+        if name == ECHO_NAME:
+            self.echo.received(fields, self.state, now_ns, self.answered_ns)
+            return
         state = apply_message(self.state, name, fields, stamp_ns)
+        if name in ("HEARTBEAT", "CURRENT_MODE"):
+            state = self.echo.confirm(state, now_ns)
         if (
             state.reset_count != self.state.reset_count
             or state.position_valid is not self.state.position_valid

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+
+from companion.vehicle.commander import ForeignSetpoint
+from companion.vehicle.setpoint_echo import SetpointEcho
+from companion.vehicle.state import VehicleState
 
 # torch is imported by the fixtures that need it: it takes longer than the collection of all tests.
 
@@ -23,6 +27,26 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
         if not path.exists():
             make(path)
     return path
+
+
+@pytest.fixture(autouse=True)
+def foreign_setpoints(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[list[ForeignSetpoint]]:
+    """Setpoints of another program that were noticed. There must be none, unless the test has another one."""
+    found: list[ForeignSetpoint] = []
+    confirm = SetpointEcho.confirm
+
+    def confirm_and_note(echo: SetpointEcho, state: VehicleState, now_ns: int) -> VehicleState:
+        after = confirm(echo, state, now_ns)
+        if after is not state and after.foreign_setpoint is not None:
+            found.append(after.foreign_setpoint)
+        return after
+
+    monkeypatch.setattr(SetpointEcho, "confirm", confirm_and_note)
+    yield found
+    if request.node.get_closest_marker("other_commander") is None:
+        assert found == []
 
 
 @pytest.fixture(scope="session")

@@ -72,6 +72,57 @@ def test_setpoints_of_another_program_end_the_command(flight: Flight, kind: str,
     )
 
 
+# Until a setpoint of another program was in three reports; of one that sends 2 a second every 80th report.
+NOTICED_WITHIN_S = {2.0: 240.0, 10.0: 30.0, 50.0: 12.0}
+BESIDE = "setpoints beside ours"
+
+
+@pytest.mark.parametrize("rate_hz", NOTICED_WITHIN_S)
+def test_setpoints_beside_ours_are_noticed(flight: Flight, rate_hz: float) -> None:
+    link = flight.link
+    flight.take_off(5.0)
+    flight.fly("hold")
+    link.after(4.0)
+    named = flight.said(BESIDE)
+    start = link.poses[-1]
+    north, east, down = start.position_ned_m
+    with repeated(
+        1.0 / rate_hz, setpoints(link, "position", Pose(0.0, (north - 20.0, east, down), (0, 0, 0), 0.0))
+    ):
+        noticed_s = link.until(named, NOTICED_WITHIN_S[rate_hz], "named as another commander")
+        link.until(
+            lambda: any(one["identity"] == BESIDE for one in flight.status["vehicle"]["other_commanders"]),
+            3.0,
+            "in the status",
+        )
+    flight.note(f"setpoints of another program at {rate_hz:g} Hz", noticed_after_s=noticed_s)
+    flight.command("stop")
+    link.until(lambda: not flight.status["vehicle"]["other_commanders"], 8.0, "alone again")
+
+
+def test_a_flight_alone_names_no_other_commander(flight: Flight) -> None:
+    link = flight.link
+    named = flight.said("another service commands this vehicle")
+    since_s = time.monotonic()
+    flight.take_off(1.5)  # PX4: by setpoints
+    for command in (
+        "hold duration=5",
+        "goto forward=10 right=5 altitude=6 speed=4",
+        "orbit radius=6 speed=2 laps=1",
+        "follow-path 0,0 10,0,8 10,10,4 speed=3",
+        "figure-eight radius=5",
+        "goto forward=0 right=0 altitude=4",
+    ):
+        flight.fly(command, 180.0)
+        assert not named(), flight.events
+    flight.fly("hold")
+    link.after(5.0)
+    flight.fly("land", 90.0)
+    link.after(2.0)
+    assert not named(), flight.events
+    flight.note("a flight alone", seconds=time.monotonic() - since_s)
+
+
 def test_a_pause_in_a_path_ends_the_command(flight: Flight) -> None:
     link = flight.link
     if link.autopilot != ARDUPILOT:

@@ -6,12 +6,14 @@ import math
 
 import pytest
 
-from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.lockstep_flight import LockstepFlight, plain_settings
+from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.setpoint_monitor import REASON
 from companion.guidance.mode_control import Phase
 from companion.vehicle.state import FlightMode
 from companion.vehicle.streamer import StreamState
+from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.setpoints import velocity_setpoint
 from tests.companion.guidance.guidance_harness import in_the_air
@@ -98,6 +100,7 @@ def test_orbit_ends_when_autopilot_fence_stops_it() -> None:
     assert 26.0 < math.hypot(north, east) < 29.0  # FENCE_MARGIN is 2
 
 
+@pytest.mark.other_commander
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_setpoints_of_another_commander_end_hold(autopilot: str) -> None:
     flight = airborne(autopilot)
@@ -106,6 +109,49 @@ def test_setpoints_of_another_commander_end_hold(autopilot: str) -> None:
     assert flight.guidance.phase is Phase.OFFBOARD
     flight.vehicle.repeat(velocity_setpoint(3.0, 0.0, 0.0), 150.0, source=STATION)
     assert flight.run_until(lambda: lost(flight), 6.0)
+
+
+@pytest.mark.other_commander
+@pytest.mark.parametrize(("rate_hz", "within_s"), [(2.0, 60.0), (10.0, 10.0), (50.0, 3.0)])
+@pytest.mark.parametrize("command", ["hold", "orbit radius=8 speed=2"])
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_setpoints_beside_ours_are_noticed(
+    autopilot: str, command: str, rate_hz: float, within_s: float
+) -> None:
+    flight = airborne(autopilot)
+    flight.command(command)
+    flight.run(6.0)
+    flight.vehicle.repeat(velocity_setpoint(1.0, 0.0, 0.0), rate_hz, source=STATION)
+    assert flight.state.foreign_setpoint is None
+    assert flight.run_until(lambda: flight.state.foreign_setpoint, within_s)
+    found = flight.state.foreign_setpoint
+    assert found is not None
+    assert found.followed.startswith("north 1.00 m/s")
+
+
+FLIGHT = (
+    ("takeoff 1.5", 20.0),
+    ("hold duration=3", 10.0),
+    ("goto forward=6 right=3 altitude=5", 30.0),
+    ("orbit radius=4 speed=2 laps=1", 40.0),
+    ("follow-path 0,0 8,0,6 8,8,3", 40.0),
+    ("figure-eight radius=4", 60.0),
+    ("hold", 4.0),
+    ("rtl", 90.0),
+)
+
+
+@pytest.mark.parametrize("autopilot", ["1.14", "1.16", "1.18", "ardupilot"])
+def test_no_phase_of_a_flight_alone_is_another_commander(autopilot: str) -> None:
+    options = {"autopilot": "ardupilot"} if autopilot == "ardupilot" else {"px4": autopilot}
+    rates_hz = {name: hz for name, hz in RATES_HZ.items() if autopilot != "1.14" or name != "CURRENT_MODE"}
+    vehicle = LockstepVehicle({"onboard": rates_hz}, seed=2, wind_mps=3.0, gusts_mps=0.6, **options)
+    flight = LockstepFlight(SimulatedDriver(vehicle), plain_settings())
+    assert flight.run_until(lambda: flight.state.ready_to_arm, 60.0)
+    for command, limit_s in FLIGHT:
+        log = flight.fly(command, limit_s)
+        assert log.outcome is None or log.outcome.success, (command, log.outcome)
+    assert flight.state.foreign_setpoint is None
 
 
 def test_single_reposition_does_not_end_command() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import json
 from dataclasses import replace
@@ -16,14 +17,15 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import CommandInput
 from companion.peer_data import PeerDataError
-from companion.service.other_commanders import FOREIGN_OFFBOARD, OtherCommanders
+from companion.service.other_commanders import FOREIGN_OFFBOARD, FOREIGN_SETPOINTS, OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
-from companion.vehicle.commander import Commander
+from companion.vehicle.commander import Commander, ForeignSetpoint
 from companion.vehicle.silence import SilenceOutcome, silence_outcome
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
-from tests.companion.live_flight import LiveFlight
+from mavlink_sim.wire.setpoints import velocity_setpoint
+from tests.companion.live_flight import LiveFlight, ground_station
 from tests.companion.service.test_health import PX4_VALUES
 from tests.companion.service_process import TWICE
 
@@ -46,9 +48,10 @@ class Here(OtherCommanders):
         silence: SilenceOutcome | None = None,
         *,
         in_command: bool = False,
+        exact_echo: bool = True,
     ) -> None:
         silence = silence or silence_outcome(NOTHING_READ, sticks_present=False)
-        super().watch(state, now_ns, silence, in_command=in_command)
+        super().watch(state, now_ns, silence, in_command=in_command, exact_echo=exact_echo)
 
     def reason(
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
@@ -211,6 +214,46 @@ def test_brief_offboard_of_ours_is_no_other_commander() -> None:
         assert here.present(offboard(now_ns), now_ns) == []
 
 
+@pytest.mark.parametrize("exact_echo", [True, False])
+def test_setpoints_beside_ours_are_reported_with_both(exact_echo: bool) -> None:
+    here, state = Here(), VehicleState(foreign_setpoint=ForeignSetpoint(NOW_NS, NOW_NS - S, "OURS", "THEIRS"))
+    for second in range(3):
+        here.watch(state, NOW_NS + second * S, in_command=True, exact_echo=exact_echo)
+    status = here.status(state, NOW_NS + 2 * S)
+    assert [(other["identity"], other["in_command"]) for other in status] == [(FOREIGN_SETPOINTS, True)][
+        : int(exact_echo)
+    ]
+    assert [level for level, _ in here.events] == ["error"][: int(exact_echo)]
+    assert all("OURS" in text and "THEIRS" in text for _, text in here.events)
+    assert (here.reason(state) is not None) is exact_echo
+    assert here.reason(state, in_command=True) is None
+    assert here.reason(state, StopBehaviour()) is None
+    here.watch(state, NOW_NS + 4 * S, exact_echo=exact_echo)
+    assert here.status(state, NOW_NS + 4 * S) == []
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "version", "options", "exact"),
+    [
+        ("PX4", (1, 14), None, True),
+        ("PX4", (1, 18), None, True),
+        ("PX4", (1, 13), None, False),
+        ("PX4", None, None, False),
+        ("ArduPilot", (4, 7), 0.0, True),
+        ("ArduPilot", (4, 7), 32.0, False),  # it reports the velocity that it has reached
+        ("ArduPilot", (4, 7), None, False),
+        ("ArduPilot", (4, 0), 0.0, False),
+        (None, None, None, False),
+    ],
+)
+def test_echo_counts_where_it_is_known_to_be_exact(
+    autopilot: str | None, version: tuple[int, int] | None, options: float | None, exact: bool
+) -> None:
+    values = () if options is None else (("GUID_OPTIONS", options),)
+    firmware = None if version is None else FirmwareVersion(*version)
+    assert AutopilotParameters(autopilot, firmware, 1, values).exact_echo is exact
+
+
 def test_command_with_our_address_refuses_until_it_is_over() -> None:
     here = Here()
     state = VehicleState(foreign_command_ns=NOW_NS - S, address_shared_ns=NOW_NS - S)
@@ -260,3 +303,36 @@ async def test_two_services_on_two_links_of_one_vehicle(kind: str, autopilot: st
             # The refused service can still end the flight, as any pilot.
             outcome = await second.fly("land")
             assert outcome.success, outcome.reason
+
+
+@pytest.mark.realtime
+@pytest.mark.other_commander
+@pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])
+async def test_setpoints_of_a_ground_station_beside_ours_are_noticed(kind: str) -> None:
+    with running_simulator(**TWICE) as simulator, ground_station(simulator.gcs_port) as station:
+        flight = LiveFlight(kind, simulator.onboard_port)
+        async with flight.running():
+            await flight.until(
+                lambda: flight.driver.state.ready_to_arm and flight.driver.state.position_ned_m
+            )
+            for text in ("takeoff 3", "hold"):
+                outcome = await flight.fly(text)
+                assert outcome.success, outcome.reason
+            assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
+            other = velocity_setpoint(0.5, 0.0, 0.0)
+
+            async def stream() -> None:
+                while True:
+                    station.mav.send(other)
+                    await asyncio.sleep(0.1)
+
+            sending = asyncio.create_task(stream())
+            try:
+                await flight.until(lambda: any(FOREIGN_SETPOINTS in text for _, text in flight.events))
+            finally:
+                sending.cancel()
+            now_ns = flight.driver.state.heartbeat_ns
+            assert FOREIGN_SETPOINTS in [
+                one["identity"] for one in flight.others.status(flight.driver.state, now_ns)
+            ]
+            assert flight.guidance.in_command

@@ -120,6 +120,26 @@ def test_sys_status_sets_readiness_and_battery(
     assert (state.ready_to_arm, state.battery_fraction) == (ready, fraction)
 
 
+@pytest.mark.parametrize(
+    ("autopilot", "enabled", "alters"),
+    [
+        ("ArduPilot", mavlink.MAV_SYS_STATUS_GEOFENCE, True),
+        ("ArduPilot", mavlink.MAV_SYS_STATUS_SENSOR_PROXIMITY, True),
+        ("ArduPilot", mavlink.MAV_SYS_STATUS_SENSOR_GPS, False),
+        ("PX4", mavlink.MAV_SYS_STATUS_GEOFENCE, False),
+    ],
+)
+def test_ardupilots_avoidance_alters_velocities(autopilot: str, enabled: int, alters: bool) -> None:
+    fields = {
+        "onboard_control_sensors_present": 0,
+        "onboard_control_sensors_enabled": enabled,
+        "onboard_control_sensors_health": 0,
+        "battery_remaining": 80,
+    }
+    state = apply_message(VehicleState(autopilot=autopilot), "SYS_STATUS", fields, 5)
+    assert state.alters_velocities is alters
+
+
 @given(name=st.sampled_from(sorted(TELEMETRY_MESSAGES - {"CURRENT_MODE"})), payload=st.binary(max_size=60))
 def test_apply_message_survives_any_payload(name: str, payload: bytes) -> None:
     definition = getattr(mavlink, f"MAVLink_{name.lower()}_message")
