@@ -236,7 +236,7 @@ class WorkerCamera(PerceptionCamera):
         )
 
     async def start(self) -> None:
-        """Start the worker. Raises PerceptionStartError, with the camera's name in its message."""
+        """Start the worker, as `PerceptionSupervisor.start`; the error has the camera's name."""
         if self.settings.source.uri == NO_SOURCE:
             return
         rotate_deg, roll_deg = self.settings.source.rotate_deg, self._given.mount_roll_deg

@@ -121,9 +121,10 @@ class Ready:
 
 @dataclass(frozen=True, slots=True)
 class StartFailed:
-    """The worker cannot start with its settings. One line."""
+    """The worker cannot start. `wrong_settings`: however often it is tried. One line."""
 
     text: str
+    wrong_settings: bool
 
 
 @dataclass(frozen=True, slots=True)

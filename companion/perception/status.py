@@ -20,7 +20,7 @@ class PerceptionState(StrEnum):
     RUNNING = "running"
     RESTARTING = "restarting"
     FINISHED = "finished"  # the source has ended
-    FAILED = "failed"  # given up
+    FAILED = "failed"  # repeatedly; tried again every 30 s
 
 
 @dataclass(frozen=True, slots=True)

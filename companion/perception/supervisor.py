@@ -1,7 +1,7 @@
 """The perception worker's supervisor: starts it, reads its messages, restarts it when it is dead or stuck.
 
 Nothing here waits for the worker: its messages are processed as they arrive. A worker that is silent for too
-long is killed. After `MAX_RESTARTS` restarts in `RESTART_WINDOW_S` the supervisor gives up and reports it.
+long is killed. After `MAX_RESTARTS` restarts in `RESTART_WINDOW_S` one is tried every `SLOW_RETRY_S`.
 """
 
 from __future__ import annotations
@@ -52,6 +52,9 @@ __all__ = ["PerceptionStartError", "PerceptionState", "PerceptionStatus", "Perce
 
 MAX_RESTARTS = 5
 RESTART_WINDOW_S = 60.0
+SLOW_RETRY_S = 30.0
+# The same reason again is reported with every so many slow tries.
+_REPORTED_TRIES = 10
 STOP_S, TERMINATE_S = 5.0, 1.0
 # A selection is answered with the next processed frame.
 SELECT_TIMEOUT_S = 3.0
@@ -66,10 +69,16 @@ class PerceptionStartError(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    """The end of a worker. `finished`: normal, and it is not restarted."""
+    """The end of a worker.
+
+    Attributes:
+        finished: normal, and it is not restarted.
+        wrong_settings: it cannot start with its settings.
+    """
 
     finished: bool
     text: str
+    wrong_settings: bool = False
 
 
 @dataclass(slots=True)
@@ -131,6 +140,11 @@ class PerceptionSupervisor:
         self._problem = ""
         self._restarts = 0
         self._deaths_s: deque[float] = deque()
+        self._tries = 0
+        self._reported: tuple[str, int] | None = None
+        self._slow = False
+        self._ready_s: float | None = None
+        self._next_try_ns: int | None = None
         self._lost_s: float | None = None
         self._newest: PerceptionResult | None = None
         self._results = 0
@@ -146,8 +160,10 @@ class PerceptionSupervisor:
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
 
+        A source that is not there, or any other failure that may pass, is tried again until then.
+
         Raises:
-            PerceptionStartError: no such model, an unknown class, or a source that cannot be opened.
+            PerceptionStartError: wrong settings: no such model or file, an unknown class, no such plug-in.
         """
         if self._task is not None:
             raise RuntimeError("a perception supervisor can be started only once; create another")
@@ -266,6 +282,16 @@ class PerceptionSupervisor:
         return self._state
 
     @property
+    def problem(self) -> str:
+        """The last error; empty: none."""
+        return self._problem
+
+    @property
+    def next_try_ns(self) -> int | None:
+        """When a worker that has failed is started again, CLOCK_MONOTONIC; None: no pause."""
+        return self._next_try_ns
+
+    @property
     def ready(self) -> Ready | None:
         """What the newest worker has loaded; None before the start."""
         return self._ready
@@ -330,18 +356,17 @@ class PerceptionSupervisor:
                 self._on_event("info", f"perception: {end.text}, after {self._before.frames} frames")
                 return
             self._problem = end.text
-            if not started.done():
+            if end.wrong_settings and not started.done():
                 self._state = PerceptionState.FAILED
                 return
             pause_s = self._after_death(end)
-            if pause_s is None:
-                self._state = PerceptionState.FAILED
-                return
-            self._state = PerceptionState.RESTARTING
+            self._state = PerceptionState.FAILED if self._slow else PerceptionState.RESTARTING
+            self._next_try_ns = time.monotonic_ns() + round(pause_s * 1e9)
             with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(pause_s):
                     await self._stop_asked.wait()
                 return
+            self._next_try_ns = None
             self._restarts += 1
 
     def _after_stop(self, end: _End) -> None:
@@ -355,23 +380,32 @@ class PerceptionSupervisor:
             text += f"; the video {self._worker_settings().recording.video} may be incomplete"
         self._on_event("warning", f"perception {text}")
 
-    def _after_death(self, end: _End) -> float | None:
-        """Report the loss; returns the seconds until the next start, None to give up."""
+    def _after_death(self, end: _End) -> float:
+        """Report the loss; returns the seconds until the next start."""
         now_s = time.monotonic()
         self._lost_s = self._lost_s or now_s
+        self._tries += 1
+        if self._slow and self._ready_s is not None and now_s - self._ready_s > SLOW_RETRY_S:
+            self._slow = False  # the last one has worked for a while
+            self._deaths_s.clear()
+        self._ready_s = None
         self._deaths_s.append(now_s)
         while now_s - self._deaths_s[0] > RESTART_WINDOW_S:
             self._deaths_s.popleft()
         deaths = len(self._deaths_s)
         if deaths > MAX_RESTARTS:
-            self._on_event(
-                "error",
-                f"perception failed {deaths} times in {RESTART_WINDOW_S:g} s, last: {end.text}; "
-                "it is not restarted",
-            )
-            return None
-        self._on_event("warning", f"perception lost: {end.text}; restarting ({deaths} of {MAX_RESTARTS})")
-        return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
+            self._slow = True
+        if not self._slow:
+            what = "lost" if self._ready is not None else "not started"
+            text = f"perception {what}: {end.text}; restarting ({deaths} of {MAX_RESTARTS})"
+            self._on_event("warning", text)
+            return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
+        reason, reported = self._reported or ("", 0)
+        if end.text != reason or self._tries - reported >= _REPORTED_TRIES:
+            self._reported = (end.text, self._tries)
+            text = f"perception failed {self._tries} times, last: {end.text}"
+            self._on_event("error", f"{text}; it is tried every {SLOW_RETRY_S:g} s")
+        return SLOW_RETRY_S
 
     async def _run_one(self, started: asyncio.Future[None]) -> _End:
         """Start one worker and supervise it until its end."""
@@ -470,7 +504,7 @@ class PerceptionSupervisor:
                 case Preview() | DepthPreview() | CloudPreview():
                     self._on_preview(replace(message, sequence=message.sequence + self._first_sequence))
                 case StartFailed():
-                    return _End(False, message.text)
+                    return _End(False, message.text, message.wrong_settings)
                 case Ended():
                     self._now.frames = message.frames
                     return _End(message.finished, message.text)
@@ -480,6 +514,7 @@ class PerceptionSupervisor:
     def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
         self._ready = ready
         self._state = PerceptionState.RUNNING
+        self._ready_s = time.monotonic()
         self._on_calibration(ready.calibration)
         self.send_hud(self._hud.lines, self._hud.highlight)
         process.watch(self._watched)

@@ -57,7 +57,7 @@ from vision.path_planner import PathRequest
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
 from vision.runtimes.exported import kind_of
-from vision.sources import EndOfStream, Source, SourceError, open_source
+from vision.sources import EndOfStream, Source, SourceError, SourceUnavailableError, check_there, open_source
 from vision.sources.shared import FrameSharing
 from vision.tracking import Selected, SelectRequest
 from vision.video_writer import VideoWriterError
@@ -236,17 +236,17 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
                     adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
                     settings = settings.model_copy(update={"camera": adopted})
                     perception.clouds.camera = adopted
-        except (
-            PluginError,
-            SourceError,
-            VideoWriterError,
-            ValueError,
-            OSError,
-        ) as error:  # CheckpointError is a ValueError
-            return StartFailed(_one_line(error))
+        except (SourceUnavailableError, MemoryError) as error:
+            return StartFailed(_one_line(error) or type(error).__name__, wrong_settings=False)
+        except (PluginError, SourceError, VideoWriterError, ValueError) as error:  # with CheckpointError
+            return StartFailed(_one_line(error), wrong_settings=True)
+        except OSError as error:
+            wrong = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
+            return StartFailed(_one_line(error), wrong_settings=wrong)
         except Exception as error:  # a bug: the traceback goes to standard error
             traceback.print_exc()
-            return StartFailed(f"perception cannot start: {type(error).__name__}: {_one_line(error)}")
+            text = f"perception cannot start: {type(error).__name__}: {_one_line(error)}"
+            return StartFailed(text, wrong_settings=False)
         # Loaded objects stay: scanning them would cost the garbage collector the time of a frame.
         gc.collect()
         gc.freeze()
@@ -304,6 +304,7 @@ def _open(begin: Begin, stack: contextlib.ExitStack, sender: ResultSender) -> Pe
     if settings.recording.video is not None:
         recording = Recording(settings.recording.video, settings.recording.rate_hz)
         stack.callback(recording.close)
+    check_there(settings.source.uri)  # before a model is loaded, for every try again
     detector = load_detector(settings) if settings.detector.enabled else None
     share = None
     if settings.source.share is not None:

@@ -5,9 +5,16 @@ A custom source is a `Capture`, and a function with the decorator `vision.source
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.latest import LatestSource
-from vision.sources.opening import open_source
+from vision.sources.opening import check_there, open_source
 from vision.sources.sequential import SequentialSource
-from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
+from vision.sources.source import (
+    EndOfStream,
+    Source,
+    SourceError,
+    SourceSettings,
+    SourceStatistics,
+    SourceUnavailableError,
+)
 
 __all__ = [
     "Capture",
@@ -20,5 +27,7 @@ __all__ = [
     "SourceError",
     "SourceSettings",
     "SourceStatistics",
+    "SourceUnavailableError",
+    "check_there",
     "open_source",
 ]

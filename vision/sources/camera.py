@@ -19,7 +19,7 @@ import cv2
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import quiet_opencv, read_capture
-from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings
+from vision.sources.source import PIPE_PIXEL_FORMATS, SourceError, SourceSettings, SourceUnavailableError
 from vision.sources.v4l2 import ControlError, fourcc_text, holders, set_exposure
 
 logger = logging.getLogger(__name__)
@@ -46,7 +46,8 @@ def check_camera(device: Path, settings: SourceSettings) -> None:
     """Check that a camera can be opened.
 
     Raises:
-        SourceError: no such device, no permission, or a pixel format that no camera has.
+        SourceUnavailableError: no such device, or no permission.
+        SourceError: a pixel format that no camera has.
     """
     if settings.pixel_format in PIPE_PIXEL_FORMATS:
         raise SourceError(
@@ -55,11 +56,11 @@ def check_camera(device: Path, settings: SourceSettings) -> None:
         )
     if not device.exists():
         others = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
-        raise SourceError(
+        raise SourceUnavailableError(
             f"{device}: no such camera; {f'found {others}' if others else 'no camera is connected'}"
         )
     if not os.access(device, os.R_OK | os.W_OK):
-        raise SourceError(
+        raise SourceUnavailableError(
             f"{device}: no permission; add the user to the group video (sudo usermod -aG video USER) "
             f"and log in again"
         )

@@ -21,6 +21,7 @@ from vision.sources.source import (
     SourceError,
     SourceSettings,
     SourceStatistics,
+    SourceUnavailableError,
 )
 
 logger = logging.getLogger(__name__)
@@ -92,12 +93,12 @@ class LatestSource(Source):
         if isinstance(end, EndOfStream):
             raise SourceError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
         if isinstance(end, SourceError) and not str(end).startswith(self.uri):
-            raise SourceError(f"{self.uri}: {end}") from end
+            raise type(end)(f"{self.uri}: {end}") from end
         raise end
 
-    def _never_opened(self) -> SourceError:
+    def _never_opened(self) -> SourceUnavailableError:
         advice = f"; {self._advice}" if self._advice else ""
-        return SourceError(
+        return SourceUnavailableError(
             f"{self.uri}: no frame within {self._settings.open_timeout_s:g} s: {self._last_reason}{advice}"
         )
 

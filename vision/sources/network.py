@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import open_ffmpeg, read_capture
-from vision.sources.source import SourceError, SourceSettings
+from vision.sources.source import SourceError, SourceSettings, SourceUnavailableError
 from vision.sources.stream_formats import MjpegParser
 
 # The HTTP library is imported by what uses it: every program with settings imports this module.
@@ -236,14 +236,14 @@ def _udp_address(uri: str, parts: SplitResult) -> tuple[str, int]:
     try:
         return str(socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)[0][4][0]), port
     except OSError as error:
-        raise SourceError(f"{uri}: {host!r} is not an address and cannot be resolved") from error
+        raise SourceUnavailableError(f"{uri}: {host!r} is not an address and cannot be resolved") from error
 
 
 def open_http(uri: str, settings: SourceSettings) -> Capture:
     """Request the stream.
 
     Raises:
-        SourceError: refused (401, 403, 404, 410).
+        SourceUnavailableError: refused (401, 403, 404, 410).
         CaptureError: no response, or an error that may be temporary.
     """
     import http.client
@@ -260,7 +260,7 @@ def open_http(uri: str, settings: SourceSettings) -> Capture:
         if error.code == 401:
             text += f"; put them into the address: {parts.scheme}://USER:PASSWORD@{parts.hostname}…"
         if error.code in _HTTP_ERRORS:
-            raise SourceError(text) from error
+            raise SourceUnavailableError(text) from error
         raise CaptureError(text) from error
     except urllib.error.URLError as error:
         cause = error.reason if isinstance(error.reason, OSError) else OSError(str(error.reason))

@@ -28,11 +28,19 @@ from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, source
 from vision.sources.sequential import SequentialSource
 from vision.sources.shared import SharedFrameCapture, check_name
-from vision.sources.source import RAW_PIXEL_FORMATS, Source, SourceError, SourceSettings
+from vision.sources.source import (
+    RAW_PIXEL_FORMATS,
+    Source,
+    SourceError,
+    SourceSettings,
+    SourceUnavailableError,
+)
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 # Their images are already taken when they arrive. A plug-in's scheme decides itself.
 _WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "realsense", "oak")
+# Suffixes of names that may be a device's, a FIFO's or a mount's, which come by themselves.
+_OF_PIPES = ("", ".fifo", ".pipe")
 _WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
 
@@ -257,12 +265,7 @@ def _rest(uri: str) -> str:
 
 
 def _open_path(path: Path, settings: SourceSettings) -> Source:
-    try:
-        mode = path.stat().st_mode
-    except FileNotFoundError:
-        raise SourceError(f"{path}: no such file, folder or device{_nearest(path)}") from None
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be opened: {error.strerror}") from error
+    mode = _mode(path)
     if stat.S_ISFIFO(mode):
         return _open_fifo(path, settings)
     if not os.access(path, os.R_OK):
@@ -281,6 +284,29 @@ def _open_path(path: Path, settings: SourceSettings) -> Source:
     if is_image(path):
         return _open_file(str(path), lambda: ImagesCapture([path], _image_rate_hz(settings)), settings)
     return _open_file(str(path), lambda: VideoFileCapture(path), settings)
+
+
+def check_there(uri: str) -> None:
+    """Check, without opening it, that the file, FIFO or device that an address names exists.
+
+    Raises:
+        SourceUnavailableError: there is no such device or FIFO yet.
+        SourceError: there is no such file.
+    """
+    if (device := camera_device(uri)) is not None:
+        check_camera(device, SourceSettings())
+    elif uri != "-" and ("://" not in uri or uri.startswith("file://")):
+        _mode(Path(_rest(uri)) if "://" in uri else Path(uri).expanduser())
+
+
+def _mode(path: Path) -> int:
+    try:
+        return path.stat().st_mode
+    except FileNotFoundError:
+        error = SourceUnavailableError if path.suffix in _OF_PIPES else SourceError
+        raise error(f"{path}: no such file, folder or device{_nearest(path)}") from None
+    except OSError as error:
+        raise SourceUnavailableError(f"{path}: cannot be opened: {error.strerror}") from error
 
 
 def _folder(uri: str) -> Path | None:

@@ -16,7 +16,7 @@ from vision.frame import Frame
 from vision.sources.capture import Capture, RawFrame
 from vision.sources.latest import LatestSource
 from vision.sources.sequential import SequentialSource
-from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings
+from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceUnavailableError
 
 logger = logging.getLogger(__name__)
 
@@ -130,11 +130,11 @@ class PairedCapture(Capture):
             frame.file_name,
         )
 
-    def _never_paired(self) -> SourceError:
+    def _never_paired(self) -> SourceUnavailableError:
         gap = (
             f"the nearest is {self._smallest_gap_s:.3g} s away" if self._smallest_gap_s < 1e9 else "none came"
         )
-        return SourceError(
+        return SourceUnavailableError(
             f"no depth within {self._tolerance_s * 1000:.3g} ms of an image, {gap}; both sources need "
             f"the same clock, and recordings the same rate (source.rate_hz)"
         )
@@ -210,7 +210,7 @@ class PairedCapture(Capture):
 
 def depth_error(error: SourceError, uri: str) -> SourceError:
     """The error of a depth source, with its address."""
-    return error if uri in str(error) else SourceError(f"source.depth {uri}: {error}")
+    return error if uri in str(error) else type(error)(f"source.depth {uri}: {error}")
 
 
 def _gap_s(one: Frame, other: Frame) -> float:

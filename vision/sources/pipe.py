@@ -21,6 +21,7 @@ from vision.sources.source import (
     EndOfStream,
     SourceError,
     SourceSettings,
+    SourceUnavailableError,
 )
 from vision.sources.stream_formats import MAGIC, MjpegParser, RawParser, StreamError, StreamParser, Y4mParser
 
@@ -142,7 +143,7 @@ def _open_fifo(path: Path) -> int:
     try:
         return os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError as error:
-        raise SourceError(f"{path}: cannot open the pipe: {error.strerror}") from error
+        raise SourceUnavailableError(f"{path}: cannot open the pipe: {error.strerror}") from error
 
 
 def check_pipe_settings(name: str, settings: SourceSettings) -> None:

@@ -8,7 +8,14 @@ from collections.abc import Callable
 
 from vision.frame import Frame
 from vision.sources.capture import CaptureError, OpenCapture, RawFrame, adapted, label
-from vision.sources.source import EndOfStream, Source, SourceError, SourceSettings, SourceStatistics
+from vision.sources.source import (
+    EndOfStream,
+    Source,
+    SourceError,
+    SourceSettings,
+    SourceStatistics,
+    SourceUnavailableError,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +39,7 @@ class SequentialSource(Source):
         try:
             self._capture = adapted(open_capture, settings)()
         except CaptureError as lost:
-            raise SourceError(f"{self.uri}: {lost}") from lost
+            raise SourceUnavailableError(f"{self.uri}: {lost}") from lost
         self._sequence = 0
         self._delivered = 0
         self._dropped = 0
@@ -56,9 +63,9 @@ class SequentialSource(Source):
         except EndOfStream as end:
             raise SourceError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
         except CaptureError as lost:
-            raise SourceError(f"{self.uri}: {lost}") from lost
+            raise SourceUnavailableError(f"{self.uri}: {lost}") from lost
         if raw is None:
-            raise SourceError(f"{self.uri}: no frame within {timeout_s:g} s; start its writer")
+            raise SourceUnavailableError(f"{self.uri}: no frame within {timeout_s:g} s; start its writer")
         return raw
 
     def read(self, timeout_s: float = 1.0) -> Frame | None:

@@ -11,7 +11,7 @@ import numpy as np
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameReader, SharedFrameWriter, segment_path
 from vision.sources.capture import Capture, CaptureError, RawFrame
-from vision.sources.source import SourceError, SourceSettings
+from vision.sources.source import SourceError, SourceSettings, SourceUnavailableError
 
 _POLL_S = 0.001  # shared memory does not notify; a poll takes some microseconds
 
@@ -115,7 +115,7 @@ class FrameSharing:
         try:
             self._writer = SharedFrameWriter(self._name, *size)
         except (OSError, ValueError) as error:
-            raise SourceError(f"frames cannot be shared as shm://{self._name}: {error}") from error
+            raise SourceUnavailableError(f"frames cannot be shared as shm://{self._name}: {error}") from error
         return self._writer
 
     def close(self) -> None:

@@ -21,6 +21,10 @@ class SourceError(Exception):
     """A source cannot be opened, or cannot continue. The text is one line that says what to do."""
 
 
+class SourceUnavailableError(SourceError):
+    """The source is not there now, or gives no frame. It may come: opening it again may succeed."""
+
+
 class CameraChangedError(SourceError):
     """The source returned with another lens or mount; open it again to use that."""
 

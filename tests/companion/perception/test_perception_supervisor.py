@@ -259,20 +259,6 @@ async def test_stopped_worker_is_stuck_and_replaced(photos: Path) -> None:
         assert supervisor.status.state is PerceptionState.RUNNING
 
 
-async def test_repeatedly_dying_worker_is_given_up(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.perception.supervisor._BACK_OFF_S", (0.01,))
-    monkeypatch.setattr("companion.perception.supervisor.MAX_RESTARTS", 1)
-    async with supervised(settings_of(photos)) as (supervisor, recorder):
-        while supervisor.status.state is not PerceptionState.FAILED:
-            if supervisor.status.pid is not None and supervisor.status.state is PerceptionState.RUNNING:
-                os.kill(supervisor.status.pid, signal.SIGKILL)
-                await until(lambda: supervisor.status.state is not PerceptionState.RUNNING)
-            await asyncio.sleep(0.01)
-        assert supervisor.status.restarts == 1
-        assert recorder.events[-1][0] == "error"
-        assert "2 times in 60 s" in recorder.events[-1][1]
-
-
 async def test_incomplete_video_is_reported_at_stop(
     photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
