@@ -296,18 +296,19 @@ async def with_service(service: Service, work: Callable[[], Coroutine[Any, Any, 
 
 
 async def with_services(services: Sequence[Service], work: Callable[[], Coroutine[Any, Any, None]]) -> None:
-    """Run services, and `work` once all are ready; then end the services.
+    """Run services, and `work` once they, their vehicles and cameras are up; then end the services.
 
     An error of a service ends the work and is raised here, and vice versa.
 
     Raises:
-        LinkError, PerceptionStartError, BusError: as `Service.run`.
+        LinkError, PerceptionStartError, BusError: as `Service.run` and `Parts.complete`.
     """
     ready = [asyncio.Event() for _ in services]
 
     async def when_ready() -> None:
-        for event in ready:
+        for event, service in zip(ready, services, strict=True):
             await event.wait()
+            await service.parts.complete(service.settings.vehicle.connect_timeout_s)
         await work()
 
     running = [

@@ -14,6 +14,10 @@ class BusError(ConnectionError):
     """The zenoh session cannot be opened (a busy port, a bad endpoint, a bad configuration file)."""
 
 
+class EndpointTakenError(BusError):
+    """An endpoint to listen on is not available now: its port is in use, or its interface is not up yet."""
+
+
 # Of one message to the service: zenoh drops a larger one before Python reads any part of it. A selector has
 # no other limit; that of a payload is smaller, and then the sender of a command is answered.
 LARGEST_RECEIVED_BYTES = 16 * 1024 * 1024

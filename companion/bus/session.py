@@ -25,7 +25,7 @@ from zenoh import ext
 
 from companion.bus.bodies.frames import CloudBody, DepthImageBody, ImageBody
 from companion.bus.command_intake import COMMANDS_PER_S, MAX_SENDER_BYTES, Allowance, CommandIntake
-from companion.bus.config import BusError, first_line, service_config, zenoh_config
+from companion.bus.config import BusError, EndpointTakenError, first_line, service_config, zenoh_config
 from companion.bus.listeners import Listener, ListenerQueue
 from companion.bus.topics import (
     RECORDER_TOPICS,
@@ -150,11 +150,16 @@ class Bus:
         """Whether at least one other node is connected, or `connect` is empty."""
         return self.open and (self._connected or not self._settings.connect)
 
+    @property
+    def missing(self) -> str:
+        """Why nothing is delivered to `connect`; empty: it is, or none is set."""
+        return "" if self.connected else f"no connection to {', '.join(self._settings.connect)}"
+
     async def start(self) -> None:
         """Open the session: at once as a peer, when the router answers as a client.
 
         Raises:
-            BusError: a peer cannot listen on its endpoints.
+            EndpointTakenError: a peer cannot listen on its endpoints now. BusError: nor ever.
         """
         self._loop = asyncio.get_running_loop()
         config = service_config(self._settings)
@@ -163,7 +168,9 @@ class Bus:
                 self._adopt(await asyncio.to_thread(_open, config))
             except zenoh.ZError as error:
                 endpoints = ", ".join(self._settings.listen)
-                raise BusError(
+                # An error of the system may pass, one of zenoh is of the settings.
+                kind = EndpointTakenError if "os error" in str(error) else BusError
+                raise kind(
                     f"zenoh cannot listen on {endpoints}: {first_line(error)}. "
                     "If a router or another service uses it, set zenoh.connect to it and zenoh.listen to none"
                 ) from error

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from companion.bus.bodies.service import (
     OtherCommanderBody,
+    PartBody,
     StatusBody,
     StatusCameraBody,
     StatusGimbalBody,
@@ -36,6 +37,7 @@ def status_message(
     *,
     uptime_s: float,
     healthy: bool,
+    parts: list[PartBody],
     driver: Driver,
     guidance: Guidance,
     streamer: Streamer,
@@ -60,6 +62,7 @@ def status_message(
         "service": poses.source,
         "uptime_s": round(uptime_s, 1),
         "healthy": healthy,
+        "parts": parts,
         "vehicle": {
             "name": poses.vehicle,
             "connected": state.connected(now_ns),

@@ -1,7 +1,8 @@
-"""The command line: `companion run`, `play`, `demo`, `detect`, `send`, `echo` and the others in ORDER.
+"""The command line: `companion view`, `run`, `play`, `detect`, `send`, `echo` and the others in ORDER.
 
 Heavy modules are imported when their command runs, so that `companion send` starts quickly.
-Invalid input prints one line on standard error and exits with code 2; a failed operation exits with code 1.
+Invalid input prints one line on standard error and exits with code 2; a failed operation exits with code 1,
+and `run` with 75 if another start may succeed.
 """
 
 from __future__ import annotations
@@ -34,6 +35,7 @@ from companion.cli.run import run
 from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
+from companion.cli.view import view
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 CLIENT_SETTINGS = ("zenoh", "vehicle.name")
 # Order of the commands in the help: by use.
 ORDER = (
+    "view",
     "play",
     "run",
     "demo",
@@ -81,6 +84,7 @@ app.add_typer(models, name="models")
 app.add_typer(calibrate, name="calibrate")
 app.add_typer(markers, name="markers")
 settings_command(app)(run)
+settings_command(app)(view)
 app.command()(demo)
 app.command()(detect)
 settings_command(app, *CLIENT_SETTINGS, epilog=known_commands)(send)

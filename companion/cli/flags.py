@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
+EXIT_PASSING = 75  # EX_TEMPFAIL of sysexits.h: another start may succeed
 YOLO = "yolo"  # vision.object_detector.YOLO, without numpy
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
@@ -99,14 +100,14 @@ def _flag_of(key: str) -> str:
 
 
 @contextmanager
-def plain_errors(*expected: type[Exception]) -> Iterator[None]:
-    """Print errors of these types as one-line messages and exit with code 2."""
+def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iterator[None]:
+    """Print errors of these types as one-line messages and exit with `code`."""
     try:
         yield
     except expected as error:
         for line in str(error).splitlines():
             typer.echo(f"companion: {line}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+        raise typer.Exit(code) from error
 
 
 def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:

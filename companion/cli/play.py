@@ -50,7 +50,9 @@ def play(
     with_camera = given.get("source.uri") != NO_SOURCE
     own = [key for key in given if key.startswith(_OWN) and (with_camera or key != "source.uri")]
     if own:
-        only = ", or give --source none for no camera" if own[0] == "source.uri" else ""
+        only = ""
+        if own[0] == "source.uri":
+            only = f"; to see {given[own[0]]}: companion view {given[own[0]]}; --source none: no camera"
         typer.echo(f"companion: {own[0]}: play uses its own camera; remove the option{only}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
     url = given.get("vehicle.url")

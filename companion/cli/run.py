@@ -6,11 +6,12 @@ import asyncio
 import gc
 import logging
 import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
+from companion.cli.flags import EXIT_FAILED, EXIT_PASSING, plain_errors, warn_rendered_only
 from companion.tasks import spawn
 from vision.gc_pause import gc_paused
 
@@ -18,14 +19,25 @@ if TYPE_CHECKING:
     from companion.service import Service
     from companion.settings import Settings
 
+# On a terminal, what is missing is said this often.
+_REMIND_S = 5.0
+
 
 def run(settings: Settings) -> None:
-    """Run the service. Ends as `companion.service.ending` says."""
+    """Run the service. It starts with what is there: autopilot and camera are used as soon as they come.
+
+    Ends as `companion.service.ending` says. Exit code 2: wrong settings; 75: another start may succeed.
+    """
+    run_service(settings)
+
+
+def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: None) -> None:
+    """Run the service, as `run`. `on_page` is called with the page's line that has its address."""
     with gc_paused():
-        from companion.bus.session import BusError
+        from companion.bus.config import BusError, EndpointTakenError
         from companion.language.process import AskProcess
         from companion.operator.line_output import use_for_standard_error
-        from companion.operator.metrics import MetricsError
+        from companion.operator.metrics import AddressTakenError, MetricsError
         from companion.perception.supervisor import PerceptionStartError
         from companion.plugins import PluginError
         from companion.service import Service
@@ -36,14 +48,17 @@ def run(settings: Settings) -> None:
     logging.basicConfig(
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
-    with plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError):
+    with (
+        plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError),
+        plain_errors(EndpointTakenError, AddressTakenError, code=EXIT_PASSING),
+    ):
         service = Service(
             settings,
             console=True,
             ask=AskProcess(settings),
             dropped_lines=lambda: 0 if output is None else output.dropped,
         )
-        asyncio.run(_run_until_signal(settings, service))
+        asyncio.run(_run_until_signal(settings, service, on_page))
 
 
 def _freeze_loaded_objects() -> None:
@@ -55,7 +70,7 @@ def _freeze_loaded_objects() -> None:
     gc.freeze()
 
 
-async def _run_until_signal(settings: Settings, service: Service) -> None:
+async def _run_until_signal(settings: Settings, service: Service, on_page: Callable[[str], None]) -> None:
     from companion.service.ending import on_ending
 
     ready = asyncio.Event()
@@ -63,36 +78,59 @@ async def _run_until_signal(settings: Settings, service: Service) -> None:
     def on_ready() -> None:
         ready.set()
         _freeze_loaded_objects()
-        # Shared frames of one of our cameras are those of its source.
-        sources = [camera.settings.source for camera in service.cameras]
-        shared = {f"shm://{source.share}": source.uri for source in sources}
-        warn_rendered_only(
-            (shared.get(source.uri, source.uri), loaded.model)
-            for camera, source in zip(service.cameras, sources, strict=True)
-            if (loaded := camera.supervisor.ready) is not None and loaded.rendered_only
-        )
 
     running = asyncio.ensure_future(service.run(on_ready))
     # Before the service is ready there is nothing to shut down.
     watch = on_ending(lambda: service.stop() if service.ready else running.cancel())
-    page = spawn(_run_dashboard(settings, ready), "dashboard")
+    beside = [
+        watch,
+        spawn(_run_dashboard(settings, ready, on_page), "dashboard"),
+        spawn(_warn_of_models(service), "warning of models"),
+    ]
+    if sys.stderr.isatty():
+        beside.append(spawn(_remind(service), "reminder"))
     try:
         await running
     except asyncio.CancelledError:
         raise typer.Exit(EXIT_FAILED) from None
     finally:
-        watch.cancel()
-        page.cancel()
-        await asyncio.gather(watch, page, return_exceptions=True)
+        for task in beside:
+            task.cancel()
+        await asyncio.gather(*beside, return_exceptions=True)
 
 
-async def _run_dashboard(settings: Settings, ready: asyncio.Event) -> None:
+async def _remind(service: Service) -> None:
+    """Say what is missing, until cancelled."""
+    while True:
+        await asyncio.sleep(_REMIND_S)
+        if text := service.parts.missing_text():
+            logging.getLogger("companion").info("%s", text)
+
+
+async def _warn_of_models(service: Service) -> None:
+    """Warn of models of rendered scenes once the cameras are up."""
+    await service.parts.complete(autopilot=False)
+    # Shared frames of one of our cameras are those of its source.
+    sources = [camera.settings.source for camera in service.cameras]
+    shared = {f"shm://{source.share}": source.uri for source in sources}
+    warn_rendered_only(
+        (shared.get(source.uri, source.uri), loaded.model)
+        for camera, source in zip(service.cameras, sources, strict=True)
+        if (loaded := camera.supervisor.ready) is not None and loaded.rendered_only
+    )
+
+
+async def _run_dashboard(settings: Settings, ready: asyncio.Event, on_page: Callable[[str], None]) -> None:
     """Run the page once the service is ready, until cancelled."""
     from companion.dashboard.process import dashboard_process
 
     def say(line: str) -> None:
         logger = logging.getLogger("companion")
-        logger.log(logging.INFO if "http://" in line else logging.WARNING, "%s", line)
+        if "http://" not in line:
+            logger.warning("%s", line)
+            return
+        logger.info("%s", line)
+        on_page(line)
 
     await ready.wait()
     async with dashboard_process(settings, say):

@@ -20,6 +20,10 @@ class MetricsError(RuntimeError):
     """The endpoint cannot be opened. The message is one line."""
 
 
+class AddressTakenError(MetricsError):
+    """The address is not available now."""
+
+
 class MetricsServer:
     """Serves `/metrics` until it is closed.
 
@@ -29,7 +33,7 @@ class MetricsServer:
             thread.
 
     Raises:
-        MetricsError: the library is not installed, or the address is not available.
+        MetricsError: the library is not installed. AddressTakenError: the address is not available.
     """
 
     def __init__(self, listen: str, snapshot: Callable[[], Status | None]) -> None:
@@ -48,7 +52,7 @@ class MetricsServer:
         try:
             self._server = open_server(host, int(port), make_wsgi_app(registry))
         except (OSError, OverflowError) as error:
-            raise MetricsError(f"metrics cannot be served on {listen}: {error}") from error
+            raise AddressTakenError(f"metrics cannot be served on {listen}: {error}") from error
         self._thread = threading.Thread(target=self._server.serve_forever, name="metrics", daemon=True)
         self._thread.start()
 

@@ -57,6 +57,7 @@ class GuidanceLoop:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
         others: other services that command the vehicle.
+        no_vehicle: returns why no command can be flown, or None.
         record: called with time, context, input and output of every step.
     """
 
@@ -71,6 +72,7 @@ class GuidanceLoop:
         on_event: Callable[[str, str], None],
         on_step: Callable[[int], None],
         others: OtherCommanders,
+        no_vehicle: Callable[[], str | None] = lambda: None,
         record: Callable[[int, StepContext, GuidanceInput, GuidanceOutput], None] = lambda *step: None,
     ) -> None:
         self.guidance, self._inputs = guidance, inputs
@@ -87,8 +89,11 @@ class GuidanceLoop:
             inputs.select,
             self._wake.set,
             on_event,
-            check_requirements=lambda command: others.check_requirements(
-                command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
+            check_requirements=lambda command: (
+                no_vehicle()
+                or others.check_requirements(
+                    command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
+                )
             ),
         )
         self._running = self._ending = False

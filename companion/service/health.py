@@ -30,6 +30,7 @@ class Health:
         inputs: gets what `check` reads for guidance.
         others: other services that command the vehicle; checked from here.
         on_event: called with (level, text) for the operator.
+        has_vehicle: an autopilot is expected.
     """
 
     def __init__(
@@ -40,7 +41,10 @@ class Health:
         notifier: SystemdNotifier,
         others: OtherCommanders,
         on_event: Callable[[str, str], None],
+        *,
+        has_vehicle: bool = True,
     ) -> None:
+        self._has_vehicle = has_vehicle
         self._driver, self._inputs, self._cameras, self._notifier = driver, inputs, cameras, notifier
         self._others, self._on_event = others, on_event
         self._heartbeat_due_ns = self._hud_due_ns = 0
@@ -56,8 +60,9 @@ class Health:
         return silence_outcome(self._inputs.parameters, sticks_present=self._driver.state.sticks_present)
 
     def healthy(self, now_ns: int) -> bool:
-        """Whether every camera delivers results and the autopilot is connected."""
-        return all(camera.seeing(now_ns) for camera in self._cameras) and self._driver.state.connected(now_ns)
+        """Whether every camera delivers results, and the autopilot, if one is expected, is connected."""
+        linked = not self._has_vehicle or self._driver.state.connected(now_ns)
+        return linked and all(camera.seeing(now_ns) for camera in self._cameras)
 
     async def run(self) -> None:
         """Run `check` whenever the link has opened or returned, or the autopilot has restarted."""
@@ -108,7 +113,9 @@ class Health:
             self._silence_of = None
             self._check_due.set()
         self._report_silence()
-        linked = self._driver.state.connected(now_ns)
+        # Until the driver has connected, the heartbeat may be that of an autopilot that it does not support.
+        found = self._driver.link_count > 0
+        linked = found and self._driver.state.connected(now_ns)
         if linked != self._linked:
             self._linked = linked
             if linked:
@@ -119,15 +126,8 @@ class Health:
         self._report_not_flown(self._driver.state)
         if now_ns >= self._heartbeat_due_ns:
             self._heartbeat_due_ns = now_ns + round(HEARTBEAT_PERIOD_S * 1e9)
-            shared = self._others.shares_address(self._driver.state, now_ns)
-            if shared and not guidance.in_command:
-                self._driver.change_address()
-            healthy = self.healthy(now_ns)
-            self._driver.send_heartbeat(
-                SystemStatus.ACTIVE if healthy else SystemStatus.CRITICAL,
-                uptime_s=self._others.uptime_s(now_ns),
-                in_command=guidance.in_command,
-            )
+            if found:  # before, the driver still chooses its address
+                self._send_heartbeat(now_ns, guidance)
             self._others.watch(
                 self._driver.state,
                 now_ns,
@@ -141,6 +141,16 @@ class Health:
             lines = hud_lines(self._driver.state, guidance.status)
             for camera in self._cameras:
                 camera.supervisor.send_hud(lines)
+
+    def _send_heartbeat(self, now_ns: int, guidance: Guidance) -> None:
+        shared = self._others.shares_address(self._driver.state, now_ns)
+        if shared and not guidance.in_command:
+            self._driver.change_address()
+        self._driver.send_heartbeat(
+            SystemStatus.ACTIVE if self.healthy(now_ns) else SystemStatus.CRITICAL,
+            uptime_s=self._others.uptime_s(now_ns),
+            in_command=guidance.in_command,
+        )
 
     def _report_not_flown(self, state: VehicleState) -> None:
         """Report a vehicle that gets no flight commands, and when it gets them again."""

@@ -1,4 +1,4 @@
-"""The service: link, perception, guidance, streamer and bus. Lost parts are reported and reconnected.
+"""The service: link, perception, guidance, streamer and bus. It starts without the parts that are missing.
 
 Everything here runs in one asyncio loop and nothing in it is heavy.
 """
@@ -29,10 +29,11 @@ from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
+from companion.service.parts import Parts
 from companion.service.publisher import Publisher
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
-from companion.service.tasks import run_until, start_together
+from companion.service.tasks import run_until
 from companion.settings import Settings
 from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
@@ -43,7 +44,7 @@ class Service:
     """The companion service of one vehicle.
 
     Attributes:
-        ready: everything is up, and commands are accepted.
+        ready: commands are answered. parts: autopilot and cameras, which may still be missing.
         cameras: the cameras with their models, the first one first.
         events: the newest, at most a hundred.
 
@@ -83,8 +84,8 @@ class Service:
             on_calibration=self._on_calibration,
         )
         self.inputs = InputAssembler(settings, self.cameras, self._event)
-        started_ns = time.monotonic_ns()
-        self.others = OtherCommanders(settings.vehicle, self.inputs.poses.source, started_ns, self._event)
+        identity, now_ns = self.inputs.poses.source, time.monotonic_ns()
+        self.others = OtherCommanders(settings.vehicle, identity, now_ns, self._event)
         self._queries = Queries(settings, self.status)
         self.bus = Bus(
             settings.zenoh,
@@ -99,11 +100,9 @@ class Service:
                 Listener(topics.VELOCITY, self.inputs.velocities.on_message, settings.vehicle.name),
             ],
         )
-        self._tap = FlightTap(
-            self.bus,
-            run_record(settings, self.guidance.options, self.inputs.poses.source),
-            expected=bool(settings.recording.directory),
-        )
+        self.parts = Parts(settings.vehicle, self.driver, self.cameras, self.bus, self._event)
+        record = run_record(settings, self.guidance.options, identity)
+        self._tap = FlightTap(self.bus, record, expected=bool(settings.recording.directory))
         self._publisher = Publisher(settings.vehicle.name, self.bus, self.driver, self.inputs, self._queries)
         self._loop = GuidanceLoop(
             *(self.guidance, self.inputs, self.driver, self.streamer),
@@ -111,22 +110,24 @@ class Service:
             on_event=self._event,
             on_step=lambda now_ns: self._health.after_step(now_ns, self.guidance),
             others=self.others,
+            no_vehicle=self.parts.no_vehicle,
             record=self._tap.on_step,
         )
         self._notifier = SystemdNotifier()
         self._health = Health(
-            self.driver, self.inputs, self.cameras, self._notifier, self.others, self._event
+            *(self.driver, self.inputs, self.cameras, self._notifier, self.others, self._event),
+            has_vehicle=settings.vehicle.expected,
         )
         self.ready = self._ending = False
         self._status: StatusBody | None = None
         self._stop = asyncio.Event()
 
     async def run(self, ready: Callable[[], None] | None = None) -> None:
-        """Start everything, call `ready`, and run until `stop()`; then let the autopilot hold and end.
+        """Open the bus, call `ready`, start the parts, run until `stop()`; then let the autopilot hold.
 
         Raises:
-            LinkError: no autopilot. PerceptionStartError: no model, classes or frames. BusError: no network.
-            MetricsError: its library is missing or its address is not available.
+            PerceptionStartError: wrong settings, see `PerceptionSupervisor.start`; never while armed.
+            BusError: zenoh cannot listen. MetricsError: no library, or its address is not available.
         """
         async with clients_of(self.settings, self._event):
             self._tap.start()
@@ -140,18 +141,15 @@ class Service:
             if self.settings.metrics.listen is not None:
                 metrics = MetricsServer(self.settings.metrics.listen, lambda: self._status)
                 self._event("info", f"metrics on port {metrics.port}")
-            await start_together(
-                self.bus.start(),
-                self.driver.connect(self.settings.vehicle.connect_timeout_s),
-                *(camera.start() for camera in self.cameras),
-            )
+            await self.bus.start()
             loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.run()]
-            loops.append(self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras))
+            publishing = self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras)
+            loops += [self.parts.run(), publishing]
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
-                console = run_console(self.command, self.stop, grammar.describe(), self._event, self._ask)
-                loops.append(console)
+                words = grammar.describe()
+                loops.append(run_console(self.command, self.stop, words, self._event, self._ask))
             tasks = [asyncio.create_task(loop) for loop in loops]
-            self._notifier.ready("flying" if self.driver.state.armed else "ready")
+            self._notifier.ready("ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")
             self.ready = True
             if ready is not None:
@@ -196,6 +194,7 @@ class Service:
             now_ns,
             uptime_s=self.others.uptime_s(now_ns),
             healthy=self._health.healthy(now_ns),
+            parts=self.parts.bodies(now_ns),
             driver=self.driver,
             guidance=self.guidance,
             streamer=self.streamer,
@@ -218,7 +217,8 @@ class Service:
             self._status = status = self.status()
             self.bus.publish(topics.STATUS, status)
             self._publisher.publish_cameras(self.cameras)
-            self._notifier.status(f"{status['vehicle']['mode']}, {status['pilot']['behaviour']}")
+            mode, behaviour = status["vehicle"]["mode"], status["pilot"]["behaviour"]
+            self._notifier.status(self.parts.missing_text() or f"{mode}, {behaviour}")
             await asyncio.sleep(1 / (topics.STATUS.rate_hz or 1.0))
 
     def _on_state(self, state: VehicleState) -> None:

@@ -16,7 +16,8 @@ HOST_AND_PORT_OR_EMPTY = StringConstraints(pattern=r"^([^\s:]+:[0-9]{1,5})?$", m
 CAMERA_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 CameraName = Annotated[str, CAMERA_NAME]
 VehicleUrl = Annotated[
-    str, StringConstraints(pattern=r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$", max_length=400)
+    str,
+    StringConstraints(pattern=r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$", max_length=400),
 ]
 # CLASS:METRES.
 HEIGHT_TEXT = StringConstraints(pattern=r"^.+:[0-9]*\.?[0-9]+$", max_length=80)
@@ -34,8 +35,8 @@ PATTERN_MEANINGS = {
     r"^https?://[^\s/]+(/\S*)?$": "an address such as http://127.0.0.1:11434",
     r"^([^\s:]+:[0-9]{1,5})?$": "HOST:PORT such as 127.0.0.1:8088, or empty",
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
-    r"^(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+$": (
-        "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
+    r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$": (
+        "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial://DEVICE:BAUD or none"
     ),
     r"^.+:[0-9]*\.?[0-9]+$": "CLASS:METRES such as person:1.7",
     r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$": (

@@ -76,6 +76,8 @@ _AUTOPILOT_VERSION_ID = 148
 _AUTOPILOT_VERSION = struct.Struct("<QQI")  # capabilities, uid, flight_sw_version; the rest is not read
 _REQUEST_MESSAGE = 512
 _VERSION_TIMEOUT_S = 2.0
+# Without a limit for the heartbeat: for one try to open the link, and for the library afterwards.
+_OPEN_S, _ATTACH_S = 5.0, 10.0
 _TIMESYNC = struct.Struct("<qqBB")  # tc1, ts1, target system and component
 _TIMESYNC_PERIOD_S = 0.5
 _IDENTIFY_PERIOD_S = 1.0
@@ -191,24 +193,26 @@ class AutopilotDriver(ABC):
 
     # --- connection ---------------------------------------------------------------------------------
 
-    async def connect(self, timeout_s: float) -> None:
+    async def connect(self, timeout_s: float | None, on_wait: Callable[[str], None] = lambda _: None) -> None:
         """See Driver. A UDP listener sends nothing first; on other links our heartbeat prompts a reply."""
         if self._link is not None:
             raise LinkError(f"{self.url}: this driver is already connected")
-        deadline = time.monotonic() + timeout_s
+        began_s = time.monotonic()
+        open_s = _OPEN_S if timeout_s is None else timeout_s
         self._reset()
         try:
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(open_s):
                 self._link = await open_link(self.url, self._received)
         except TimeoutError as error:
-            raise LinkError(f"{self.url}: could not be opened within {timeout_s:g} s") from error
+            raise LinkError(f"{self.url}: could not be opened within {open_s:g} s") from error
         try:
             opened_s = time.monotonic()
-            await self._first_heartbeat(timeout_s)
+            await self._first_heartbeat(timeout_s, on_wait)
             if self._autopilot_kind not in self.supported_autopilots:
                 raise LinkError(unsupported_autopilot(self.url, self._system_id, self._autopilot_kind))
             await self._choose_address(opened_s)
-            await self._attach(max(deadline - time.monotonic(), 1.0))
+            left_s = _ATTACH_S if timeout_s is None else began_s + timeout_s - time.monotonic()
+            await self._attach(max(left_s, 1.0))
             await self._identify()
         except BaseException:
             await self.close()
@@ -271,24 +275,26 @@ class AutopilotDriver(ABC):
             if link is not None:
                 await link.close()
 
-    async def _first_heartbeat(self, timeout_s: float) -> None:
+    async def _first_heartbeat(self, timeout_s: float | None, on_wait: Callable[[str], None]) -> None:
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(timeout_s):
                 while not self._heartbeat_received.is_set():
                     if self.url.scheme is not LinkScheme.UDP_IN:
                         self._prompt()
-                    await _wait_event(self._heartbeat_received, 1.0)
+                    if not await _wait_event(self._heartbeat_received, 1.0):
+                        on_wait(self._no_autopilot(None))
         if not self._heartbeat_received.is_set():
-            raise LinkError(
-                no_autopilot_text(
-                    self.url,
-                    timeout_s,
-                    wanted_system_id=self._wanted_system_id,
-                    others=self._others,
-                    signer=self._signer,
-                    skipped_bytes=self._framer.skipped_bytes,
-                )
-            )
+            raise LinkError(self._no_autopilot(timeout_s))
+
+    def _no_autopilot(self, timeout_s: float | None) -> str:
+        return no_autopilot_text(
+            self.url,
+            timeout_s,
+            wanted_system_id=self._wanted_system_id,
+            others=self._others,
+            signer=self._signer,
+            skipped_bytes=self._framer.skipped_bytes,
+        )
 
     def _prompt(self) -> None:
         """Send a heartbeat, so that the peer learns where we are, before our address is chosen.

@@ -63,6 +63,8 @@ async def open_link(url: LinkUrl, received: Received) -> ByteLink:
     Raises:
         LinkError: the endpoint cannot be opened; one line with the reason and what to do.
     """
+    if url.scheme is LinkScheme.NONE:
+        raise LinkError("there is no vehicle: vehicle.url is none")
     if url.scheme in (LinkScheme.UDP_IN, LinkScheme.UDP_OUT):
         return await _open_udp(url, received)
     link = _StreamLink(url, received)
@@ -304,10 +306,7 @@ async def _open_tcp(url: LinkUrl) -> int:
 
 async def _open_serial(url: LinkUrl) -> int:
     device, baud = url.address
-    speed = getattr(termios, f"B{baud}", None)
-    if speed is None:
-        rates = sorted(int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit())
-        raise LinkError(f"{url}: baud rate {baud} is not supported; supported: {rates}")
+    speed = getattr(termios, f"B{baud}")
     descriptor = -1
     try:
         descriptor = os.open(device, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)

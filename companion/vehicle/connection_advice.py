@@ -14,7 +14,7 @@ _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 
 def no_autopilot_text(
     url: LinkUrl,
-    timeout_s: float,
+    timeout_s: float | None,
     *,
     wanted_system_id: int | None,
     others: Iterable[tuple[Any, ...]],
@@ -24,6 +24,7 @@ def no_autopilot_text(
     """Explain a missing autopilot heartbeat by what was received instead.
 
     Args:
+        timeout_s: None: it is still waited for. The text then changes only with the reason.
         others: other senders: system id, component id, further fields.
         signer: checks signatures, if any. skipped_bytes: received bytes that are not MAVLink.
     """
@@ -32,15 +33,19 @@ def no_autopilot_text(
     if senders:
         advice = f"received only system/component {senders}; check the system id and what is connected"
     elif signer is not None and signer.refused:
-        reasons = ", ".join(f"{count} {reason}" for reason, count in signer.refused.items())
+        reasons = ", ".join(
+            reason if timeout_s is None else f"{count} {reason}" for reason, count in signer.refused.items()
+        )
         advice = f"its frames failed the signature check ({reasons}); both ends need the same key"
     elif skipped_bytes:
-        advice = f"received {skipped_bytes} bytes that are not MAVLink; check the baud rate and the device"
+        count = "" if timeout_s is None else f"{skipped_bytes} "
+        advice = f"received {count}bytes that are not MAVLink; check the baud rate and the device"
     elif url.scheme is LinkScheme.UDP_IN:
         advice = "nothing received; check that the vehicle is on and sends to this address and port"
     else:
         advice = "nothing received; check that the vehicle is on, and the address or device"
-    return f"no autopilot heartbeat{origin} on {url} within {timeout_s:g} s: {advice}"
+    within = "" if timeout_s is None else f" within {timeout_s:g} s"
+    return f"no autopilot heartbeat{origin} on {url}{within}: {advice}"
 
 
 def no_answer_advice(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:

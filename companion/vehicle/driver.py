@@ -49,19 +49,24 @@ class SystemStatus(IntEnum):
 class Driver(Protocol):
     """A link to one autopilot. All methods are called from one asyncio loop.
 
-    `url` is `udpin://HOST:PORT` (listen, as PX4 SITL sends to 14540), `udpout://HOST:PORT`, `tcp://HOST:PORT`
-    or `serial:///dev/ttyAMA0:921600`.
+    `url` is `udpin://HOST:PORT` (listen, as PX4 SITL sends to 14540), `udpout://HOST:PORT`, `tcp://HOST:PORT`,
+    `serial:///dev/ttyAMA0:921600`, or `none`: there is no vehicle, and `connect` fails.
     """
 
     @property
     def library(self) -> str:
         """The MAVLink library: "pymavlink" or "mavsdk"."""
 
-    async def connect(self, timeout_s: float) -> None:
+    async def connect(self, timeout_s: float | None, on_wait: Callable[[str], None] = lambda _: None) -> None:
         """Open the link and wait for the autopilot's first heartbeat.
 
+        Args:
+            timeout_s: None: the heartbeat is waited for without limit.
+            on_wait: called every second meanwhile, with the reason why it may not come.
+
         Raises:
-            LinkError: the endpoint cannot be opened (busy port, no such device, bad url), or no heartbeat.
+            LinkError: the endpoint cannot be opened (busy port, no such device, bad url), no heartbeat within
+                `timeout_s`, or one of an unsupported autopilot. The driver is closed then.
         """
 
     async def close(self) -> None:
@@ -82,7 +87,10 @@ class Driver(Protocol):
 
     @property
     def link_count(self) -> int:
-        """How often the link has opened, returned after silence, or the autopilot has restarted."""
+        """How often the link has opened, returned after silence, or the autopilot has restarted.
+
+        0 until `connect` has found the autopilot.
+        """
 
     @property
     def state(self) -> VehicleState:

@@ -122,7 +122,7 @@ class ServiceProcess:
 
 @contextmanager
 def heartbeats() -> Iterator[int]:
-    """An autopilot that sends heartbeats only: the service becomes ready. Yields the port.
+    """An autopilot that sends heartbeats only: the service connects. Yields the port.
 
     For tests that neither fly nor read telemetry: a simulator needs as much of the processor as the service.
     """
@@ -160,7 +160,7 @@ def running_service(
     endpoint: str | None = None,
     stdin: int = subprocess.DEVNULL,
 ) -> Iterator[ServiceProcess]:
-    """Start `companion run`, wait until it accepts commands, stop it afterwards.
+    """Start `companion run`, wait until its vehicle and cameras are up, stop it afterwards.
 
     An exception in between gets the service's last lines as a note.
     """
@@ -173,7 +173,7 @@ def running_service(
     process = subprocess.Popen(command, stdin=stdin, stderr=subprocess.PIPE, cwd=cwd)
     service = ServiceProcess(process, endpoint)
     try:
-        service.wait_for_line("ready: commands on", START_S)
+        service.wait_for_line(" up: autopilot", START_S)
         yield service
     except BaseException as error:  # a test's timeout is not an Exception
         error.add_note("\n".join(["last lines of the service:", *service.last_lines()]))

@@ -9,6 +9,7 @@ from typing import Any, cast
 import pytest
 
 from companion.service import Service
+from companion.settings import Settings
 from companion.sim_session import SimSessionError, with_service
 
 
@@ -17,6 +18,7 @@ class EndingService:
 
     def __init__(self, error: Exception | None, *, early: bool = False) -> None:
         self.ready = False
+        self.settings, self.parts = Settings(), self
         self._error = error
         self._stopped = asyncio.Event()
         if early:
@@ -28,6 +30,9 @@ class EndingService:
         await self._stopped.wait()
         if self._error is not None:
             raise self._error
+
+    async def complete(self, within_s: float) -> None:
+        """All parts are up."""
 
     def stop(self) -> None:
         self._stopped.set()

@@ -240,6 +240,21 @@ class StatusBusBody(TypedDict):
     """topic that is listened to: messages that were too large, not valid, or too many"""
 
 
+class PartBody(TypedDict):
+    """A part from outside: the autopilot, a camera, zenoh."""
+
+    name: str
+    """autopilot, camera, camera NAME or zenoh"""
+    state: str
+    """starting, ready, missing, retrying, failed or finished"""
+    reason: str
+    """why it is not ready; empty: it is"""
+    since_ns: int
+    """begin of the state"""
+    next_try_ns: int | None
+    """when it is tried again; null: all the time, or it needs no try"""
+
+
 class StatusLogBody(TypedDict):
     """The log."""
 
@@ -257,7 +272,9 @@ class StatusBody(TypedDict):
     uptime_s: float
     """since the start of the service"""
     healthy: bool
-    """every camera delivers results and the autopilot is connected"""
+    """every camera delivers results, and the autopilot, if there is to be one, is connected"""
+    parts: list[PartBody]
+    """what comes from outside; without an autopilot in it there is no vehicle (vehicle.url is none)"""
     vehicle: StatusVehicleBody
     """the link to the vehicle"""
     pilot: StatusPilotBody

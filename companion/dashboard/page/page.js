@@ -60,10 +60,18 @@ function linkText() {
   if (old == null) return ["waiting for the service", false];
   if (old > STATUS_STALE_S) return [`Stale: the last state came ${old.toFixed(0)} s ago.`, true];
   const { vehicle, status } = state.topics;
-  if (vehicle && vehicle.connected === false) return ["Autopilot heartbeat lost.", true];
-  if (!status) return ["", false];
+  if (!status) return vehicle && vehicle.connected === false ? ["No autopilot heartbeat.", true] : ["", false];
+  const parts = status.parts || []; // an older service has none
+  const waiting = parts.filter((part) => !["ready", "finished"].includes(part.state));
+  if (waiting.length) return [`Waiting for ${waiting.map((part) => partText(part, status.stamp_ns)).join(" · ")}`, true];
   const health = status.healthy ? "healthy" : "not healthy";
-  return [`${status.vehicle.autopilot || "autopilot"} · ${health}`, !status.healthy];
+  const hasVehicle = !status.parts || parts.some((part) => part.name === "autopilot");
+  return [`${hasVehicle ? status.vehicle.autopilot || "autopilot" : "no vehicle"} · ${health}`, !status.healthy];
+}
+
+function partText({ name, state: word, reason, next_try_ns: nextNs }, nowNs) {
+  const next = nextNs == null ? "" : `, next try in ${Math.max(0, (nextNs - nowNs) / 1e9).toFixed(0)} s`;
+  return `${name}: ${reason || word}${next}`;
 }
 
 function renderFleet() {

@@ -434,7 +434,10 @@ def test_page_shows_the_state_and_the_menu_of_a_track(window: Tab) -> None:
     found = {**FOUND, "ground_range_m": 4.2, "distance_m": 6.0, "depth_m": 5.4}
     jpeg = cv2.imencode(".jpg", np.zeros((480, 640, 3), np.uint8))[1].tobytes()
     asked, sent = {"velocity_ned_mps": [2.0, 0.0, 0.0]}, {"velocity_ned_mps": [1.5, 0.0, 0.0]}
+    camera = {"name": "camera", "state": "failed", "reason": "no camera 9", "next_try_ns": 8_000_000_000}
+    autopilot = {"name": "autopilot", "state": "ready", "reason": "", "next_try_ns": None}
     status = {"healthy": True, "vehicle": {}, "limits": limits, "pilot": {"mission": MISSION}, "gimbal": None}
+    status |= {"parts": [autopilot, camera], "stamp_ns": 1_000_000_000}
     messages = {
         STATUS.key(NAME): status,
         VEHICLE.key(NAME): vehicle,
@@ -464,6 +467,9 @@ def test_page_shows_the_state_and_the_menu_of_a_track(window: Tab) -> None:
             assert text(selector)[-len(expected) :] == expected
 
         wait_for(shown)
+        becomes("#link", ["Waiting for camera: no camera 9, next try in 7 s"])
+        status["parts"] = []
+        becomes("#link", ["no vehicle · healthy"])
         becomes("#mode, #armed, #height, #speed, #battery", ["offboard", "yes", "4.0 m", "1.0 m/s", "73 %"])
         # Over ground, never along the camera's axis.
         becomes("#detections td:nth-child(4)", ["4.2 m", "–"])

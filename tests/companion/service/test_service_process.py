@@ -268,7 +268,7 @@ def test_mission_is_flown_and_flight_survives_a_killed_worker(seeing: list[str],
 
 def test_failure_notes_the_services_last_lines(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     program = tmp_path / "python"
-    program.write_text("#!/bin/sh\necho line 6 >&2\necho ready: commands on vehicle1 >&2\nexec sleep 60\n")
+    program.write_text("#!/bin/sh\necho line 6 >&2\necho service: up: autopilot >&2\nexec sleep 60\n")
     program.chmod(0o700)
     monkeypatch.setattr("sys.executable", str(program))
     with (
@@ -277,7 +277,7 @@ def test_failure_notes_the_services_last_lines(tmp_path: Path, monkeypatch: pyte
     ):
         service.wait_for_line("line 7", 0.1)
     (note,) = failure.value.__notes__
-    assert "ready: commands " in note
+    assert " up: " in note
     assert "line 6" in note
 
 

@@ -134,7 +134,7 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
         (
             "vehicle.url",
             "/dev/ttyS0",
-            "must be udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD, "
+            "must be udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial://DEVICE:BAUD or none, "
             'got "/dev/ttyS0"',
         ),
         (

@@ -15,6 +15,7 @@ from companion.vehicle.link_url import LinkScheme, LinkUrl, LinkUrlError, parse_
         ("udpin://127.0.0.1:1", LinkScheme.UDP_IN, ("127.0.0.1", 1)),
         ("udpout://vehicle.local:14580", LinkScheme.UDP_OUT, ("vehicle.local", 14580)),
         ("udpin://[::1]:14540", LinkScheme.UDP_IN, ("::1", 14540)),
+        ("none", LinkScheme.NONE, ("", 0)),
         ("tcp://localhost:5760/", LinkScheme.TCP, ("localhost", 5760)),
         ("serial:///dev/ttyAMA0:921600", LinkScheme.SERIAL, ("/dev/ttyAMA0", 921600)),
         (
@@ -46,7 +47,9 @@ def test_every_form_round_trips(text: str, scheme: LinkScheme, address: tuple[st
         ("tcp://a b:1", "tcp://HOST:PORT"),
         ("serial://ttyAMA0:57600", "serial:///dev/NAME:BAUD"),
         ("serial:///dev/ttyAMA0", "serial:///dev/NAME:BAUD"),
-        ("serial:///dev/ttyAMA0:0", "above 0"),
+        ("serial:///dev/ttyAMA0:0", "0 is not supported"),
+        ("serial:///dev/ttyAMA0:12345", "12345 .*not supported; supported: .*57600"),
+        ("none://", "not a link url"),
         ("http://127.0.0.1:80", "not a link url"),
     ],
 )
