@@ -20,6 +20,8 @@ from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+from vision.extras import missing_module
+
 Result = TypeVar("Result")
 
 # Of workers that died, for one seed on a cluster, for all seeds in processes of this machine.
@@ -145,7 +147,7 @@ def _connected(address: str) -> Any:
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ClusterError(f"--ray: {error}: pip install 'mavlink-companion[cluster]'") from error
+        raise ClusterError(f"--ray: {missing_module(error) or error}") from error
     host, _, port = address.rpartition(":")
     if not host or not port.isdecimal() or "/" in host:
         raise ClusterError(f"--ray {address}: expected HOST:PORT, as `ray start --head --port PORT` opens it")

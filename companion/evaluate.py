@@ -19,10 +19,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from vision.detections import Detections
-from vision.detector import DEFAULT_MODEL
+from vision.detector import DEFAULT_MODEL, model_path
 from vision.evaluation.datasets import Dataset, DatasetError, fold_name, read_image
 from vision.evaluation.misses import WorstMisses
-from vision.model_files import find_model
 from vision.pipeline import FrameDetector
 from vision.runtimes.base import Precision
 from vision.runtimes.exported import kind_of
@@ -87,7 +86,7 @@ class Evaluation:
 
 def usual_precision(model: str) -> Precision:
     """float32, so that figures can be compared; `auto` for an exported file of a fixed precision."""
-    path = find_model(model)
+    path = model_path(model)
     if model == DEFAULT_MODEL or kind_of(path) is None:
         return "float32"
     return "auto" if read_source(path).fixed_precision else "float32"

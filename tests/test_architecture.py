@@ -149,6 +149,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.calibration.camera_info",
     "vision.camera_model",
     "vision.depth_registration",
+    "vision.extras",
     "vision.frame",
     "vision.geolocation",
     "vision.gc_pause",

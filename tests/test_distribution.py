@@ -40,7 +40,7 @@ def test_wheel_holds_the_packages_and_their_data(tmp_path: Path) -> None:
     ]
     wanted = {path.relative_to(ROOT).as_posix() for path in sources}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("mavlink_sim/scenes/*.toml")}
-    wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("vision/weights/*.safetensors")}
+    wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("vision/weights/default.*")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/dashboard/page/*")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/guidance/policies/*.onnx")}
     wanted |= {f"{package}/py.typed" for package in packages}

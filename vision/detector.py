@@ -30,11 +30,11 @@ from vision.object_detector import (
     resolve_classes,
 )
 from vision.registry import shown
-from vision.runtimes.base import PRECISIONS, Device, Precision
+from vision.runtimes.base import PRECISIONS, Device, Precision, installed
 from vision.runtimes.selection import RuntimeChoice, check_runtime, check_runtime_name, start_runtime
 from vision.runtimes.source import ModelSource, read_source
 from vision.runtimes.stored_choice import forget_choices
-from vision.weights import DEFAULT_WEIGHTS
+from vision.weights import DEFAULT_EXPORT, DEFAULT_WEIGHTS
 from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.postprocess import Boxes, boxes_from, candidates_of, decode_ltrb
 from vision.yolo.safe_pickle import CheckpointError
@@ -95,9 +95,9 @@ class Detector(ObjectDetector):
         """Load the model.
 
         Args:
-            model: `default`, the bundled one, or the path of a checkpoint (our own, or an Ultralytics `.pt`),
-                of a file exported by `vision.runtimes.export`, or of another exporter's that is recognised
-                (`vision.foreign.layouts`).
+            model: `default`, the bundled one, of the file that `model_path` says, or the path of a checkpoint
+                (our own, or an Ultralytics `.pt`), of a file exported by `vision.runtimes.export`, or of
+                another exporter's that is recognised (`vision.foreign.layouts`).
             classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.
             iou: NMS IoU threshold, 0..1: of two boxes of one class overlapping more, the less confident is
@@ -127,7 +127,7 @@ class Detector(ObjectDetector):
             raise ValueError(f"threads must be at least 1, got {threads}")
         check_runtime_name(runtime)  # before torch is imported to read a checkpoint
         fit(image_size, image_size, image_size)  # Rejects a bad size now, not at the first frame.
-        source = read_source(_model_path(model))
+        source = read_source(model_path(model, runtime, precision, device))
         self._stride = max(source.strides)
         if source.foreign is None or source.foreign.fixed_size is None:
             fit(image_size, image_size, image_size, stride=self._stride)
@@ -336,7 +336,7 @@ def class_names_of(
         CheckpointError: the model cannot be read.
         RuntimeMissingError, RuntimeUnusableError: the runtime is not installed, or cannot run such a file.
     """
-    source = read_source(_model_path(model))
+    source = read_source(model_path(model, runtime))
     check_runtime(source, runtime)
     return source.class_names
 
@@ -348,15 +348,40 @@ def forget_measurements(model: str | Path) -> None:
         CheckpointError: there is no such model.
         OSError: a stored measurement cannot be deleted.
     """
-    forget_choices(weights_sha256(read_source(_model_path(model)).weights_path))
+    bundled = str(model) == DEFAULT_MODEL
+    for path in (
+        (DEFAULT_EXPORT, DEFAULT_WEIGHTS) if bundled else (read_source(find_model(model)).weights_path,)
+    ):
+        forget_choices(weights_sha256(path))
 
 
-def _model_path(model: str | Path) -> Path:
+def model_path(
+    model: str | Path,
+    runtime: RuntimeChoice | None = None,
+    precision: Precision = "auto",
+    device: Device = "cpu",
+) -> Path:
+    """The file of a model. The bundled one has two: its export, and its checkpoint where that is needed.
+
+    The checkpoint is for what the export cannot do, and needs torch: the runtimes torch and tensorrt, another
+    device, and half precision of no named runtime. `auto` measures all runtimes where torch is installed.
+    Arguments as of `Detector`.
+
+    Raises:
+        CheckpointError: a file of the bundled model is missing.
+    """
     if str(model) != DEFAULT_MODEL:
         return find_model(model)
-    if not DEFAULT_WEIGHTS.is_file():
+    needs_checkpoint = (
+        runtime in ("torch", "tensorrt")
+        or device != "cpu"
+        or (runtime is None and precision in ("bfloat16", "float16"))
+        or (runtime == "auto" and installed("torch"))
+    )
+    path = DEFAULT_WEIGHTS if needs_checkpoint else DEFAULT_EXPORT
+    if not path.is_file():
         raise CheckpointError(
-            f"{DEFAULT_WEIGHTS}: the bundled model is missing from this installation; "
+            f"{path}: the bundled model is missing from this installation; "
             "reinstall the package, train one with `companion train`, or give the path of another"
         )
-    return DEFAULT_WEIGHTS
+    return path

@@ -17,6 +17,7 @@ import numpy as np
 
 from vision.annotate import annotate_level
 from vision.detections import Detections
+from vision.extras import install_command
 from vision.frame import Frame
 from vision.levelling import Levelling
 from vision.video_writer import VideoWriter, VideoWriterError
@@ -117,7 +118,7 @@ class Recording:
                 "%s: %d frames are missing, the encoder was too slow; lower rate_hz%s",
                 self._path,
                 self.skipped,
-                "" if find_spec("av") else ", or pip install 'mavlink-companion[video]' for a faster encoder",
+                "" if find_spec("av") else f", or {install_command('av')} for a faster encoder",
             )
 
     def _run(self) -> None:

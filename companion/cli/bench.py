@@ -81,7 +81,7 @@ def bench_latency(
     seconds: Annotated[
         float, typer.Option(min=1, help="Duration of the measurement in flight, seconds.")
     ] = 10.0,
-    driver: Annotated[str, typer.Option(help="Driver: pymavlink or mavsdk.")] = "pymavlink",
+    driver: Annotated[Literal["pymavlink", "mavsdk"], typer.Option(help="Driver.")] = "pymavlink",
     as_json: _JSON = False,
 ) -> None:
     """Measure the latency from frame to setpoint. Flies the simulated vehicle."""

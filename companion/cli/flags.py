@@ -17,6 +17,7 @@ import typer
 import typer.core
 import typer.main
 
+from vision.extras import missing_module
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -57,12 +58,20 @@ RayAddress = Annotated[
 
 
 class CompanionCommands(typer.core.TyperGroup):
-    """The commands. One without a setting names the new flag too if it is given the setting's former one."""
+    """The commands. One without a setting names the new flag too if it is given the setting's former one.
+
+    What needs a module of an extra that is not installed says so in one line, and exits with code 2.
+    """
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was given."""
         try:
             return super().invoke(ctx)
+        except ModuleNotFoundError as error:
+            if (line := missing_module(error)) is None:
+                raise
+            typer.echo(f"companion: {ctx.invoked_subcommand}: {line}", err=True)
+            raise typer.Exit(EXIT_BAD_INPUT) from error
         except _UsageError as error:
             if text := _renamed_flag(getattr(error, "option_name", "")):
                 raise _UsageError(text, error.ctx) from error

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.cli.flags import plain_errors
 
 if TYPE_CHECKING:
     from companion.dashboard.access import Access
@@ -41,11 +41,8 @@ def mcp(
     while a command that this server started is active; they end it. After a pilot took over, nothing is
     executed until an operator has commanded in another way, or this server is restarted.
     """
-    try:
-        import mcp.server  # noqa: F401
-    except ImportError as error:
-        typer.echo(f"companion: mcp needs the extra `mcp`: pip install '.[mcp]' ({error})", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+    import mcp.server  # noqa: F401 - before anything is read: it is of an extra
+
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
     from companion.dashboard.access import DashboardError

@@ -59,11 +59,14 @@ def info(
     """Describe a model file. Prints family, classes, GFLOPs, licence, runtime and precision."""
     from companion.models.export_info import export_info, export_lines
     from companion.models.info import info_lines, model_info
+    from vision.detector import model_path
+    from vision.runtimes.selection import check_runtime_name
     from vision.runtimes.source import read_source
     from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
-        source = read_source(_path(file))
+        check_runtime_name(runtime)
+        source = read_source(model_path(file, runtime))  # type: ignore[arg-type]  # checked above
         if source.kind is not None or source.foreign is not None:
             export = export_info(source, image_size, runtime)  # type: ignore[arg-type]  # checked there
             plain, lines = export.plain(), export_lines(export)
@@ -131,7 +134,7 @@ def export(
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
     from vision.yolo.published import model_family_of
 
-    path = _path(file)
+    path = _checkpoint(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         if precision not in ("float32", "int8"):
             raise ValueError(f"--precision must be float32 or int8; got {precision!r}")
@@ -172,7 +175,7 @@ def verify(
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         samples = sample_images(images, count)
-        parity = verify(_path(source), exported, samples, image_size, threads=threads)
+        parity = verify(_checkpoint(source), exported, samples, image_size, threads=threads)
     holds = parity.holds(map_tolerance, box_tolerance)
     if as_json:
         typer.echo(json.dumps({**parity.plain(), "holds": holds}))
@@ -184,7 +187,7 @@ def verify(
         raise typer.Exit(1)
 
 
-def _path(model: str) -> Path:
+def _checkpoint(model: str) -> Path:
     from vision.detector import DEFAULT_MODEL
     from vision.model_files import find_model
     from vision.weights import DEFAULT_WEIGHTS

@@ -6,8 +6,6 @@ import json
 import signal
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,15 +30,6 @@ log = typer.Typer(
 )
 
 
-@contextmanager
-def _with_library() -> Iterator[None]:
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        typer.echo(f"companion: {error}: pip install 'mavlink-companion[recording]'", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
-
-
 def record(
     settings: Settings,
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the recordings.")],
@@ -49,11 +38,9 @@ def record(
     """Record a running service. Writes MCAP files until Ctrl-C or SIGTERM."""
     from companion.bus.client import NoAnswerError, client_settings
     from companion.bus.config import BusError
-
-    with _with_library():
-        from companion.recording import RecordingError
-        from companion.recording.recorder import RecorderOptions
-        from companion.recording.recorder import record as record_until
+    from companion.recording import RecordingError
+    from companion.recording.recorder import RecorderOptions
+    from companion.recording.recorder import record as record_until
 
     ending = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -93,12 +80,11 @@ def replay(
     there, without an operator's selection.
     """
     from companion.plugins import PluginError, load_plugins
+    from companion.recording import RecordingError
+    from companion.replay import replay as replay_files
+    from companion.replay import report
     from companion.settings.reading import ConfigurationError
 
-    with _with_library():
-        from companion.recording import RecordingError
-        from companion.replay import replay as replay_files
-        from companion.replay import report
     with plain_errors(RecordingError, ConfigurationError, PluginError, ValueError):  # of a model
         load_plugins(settings.plugins.modules)
         found = replay_files(files, dict(map(_key_and_value, changes or ())), model)
@@ -131,13 +117,12 @@ def collect(
     service until Ctrl-C. The labels are the model's own boxes; correct them, then train with `companion
     train --data FOLDER`.
     """
+    from companion import collect as collecting
     from companion.bus.client import NoAnswerError, client_settings
     from companion.bus.config import BusError
+    from companion.recording import RecordingError
+    from companion.recording.frames import recorded_frames
 
-    with _with_library():
-        from companion import collect as collecting
-        from companion.recording import RecordingError
-        from companion.recording.frames import recorded_frames
     ending = threading.Event()
     kept = 0
     with plain_errors(RecordingError, NoAnswerError, BusError, ValueError, OSError):
@@ -174,9 +159,9 @@ def sightings(
     if as_geojson == as_kml:
         typer.echo("companion: expected --geojson or --kml, one of them", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
-    with _with_library():
-        from companion import sightings as found_in
-        from companion.recording import RecordingError
+    from companion import sightings as found_in
+    from companion.recording import RecordingError
+
     with plain_errors(RecordingError):
         found = found_in.sightings(files)
     typer.echo(found_in.geojson(found) if as_geojson else found_in.kml(found))
@@ -190,9 +175,9 @@ def list_recordings(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per file.")] = False,
 ) -> None:
     """List the recordings of a folder. Prints for each: vehicle, start, duration, size, flights."""
-    with _with_library():
-        from companion.flight_log import listed, summaries
-        from companion.recording import RecordingError
+    from companion.flight_log import listed, summaries
+    from companion.recording import RecordingError
+
     with plain_errors(RecordingError):
         for found in summaries(directory):
             if isinstance(found, RecordingError):
@@ -210,9 +195,9 @@ def show_recording(
 
     Prints events, modes, arming, refused commands, images, depth, losses and damage.
     """
-    with _with_library():
-        from companion.flight_log import shown, summarize
-        from companion.recording import RecordingError
+    from companion.flight_log import shown, summarize
+    from companion.recording import RecordingError
+
     with plain_errors(RecordingError):
         found = summarize(file)
     if as_json:
@@ -228,9 +213,9 @@ def recover_recording(
     output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The new file.")],
 ) -> None:
     """Copy what can be read of a recording to a new, complete file."""
-    with _with_library():
-        from companion.recording import RecordingError
-        from companion.recording.files import recover
+    from companion.recording import RecordingError
+    from companion.recording.files import recover
+
     with plain_errors(RecordingError):
         problems, messages = recover(file, output)
     for line in problems:
@@ -249,9 +234,9 @@ def write_tlog(
 
     The file has both directions, for ground stations.
     """
-    with _with_library():
-        from companion.recording import RecordingError
-        from companion.recording.tlog import write_tlog as write
+    from companion.recording import RecordingError
+    from companion.recording.tlog import write_tlog as write
+
     output = output or file.with_suffix(".tlog")
     with plain_errors(RecordingError):
         problems, frames = write(file, output)
@@ -270,9 +255,9 @@ def add_ulog(
 
     Converts the log's times to the recording's.
     """
-    with _with_library():
-        from companion.recording import RecordingError
-        from companion.recording.ulog import merge_ulog
+    from companion.recording import RecordingError
+    from companion.recording.ulog import merge_ulog
+
     with plain_errors(RecordingError):
         merged = merge_ulog(file, ulog, output)
     for line in merged.problems:

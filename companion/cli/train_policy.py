@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from companion.campaign import MAX_SEED, ClusterError, SeedError, seeds_of
-from companion.cli.flags import EXIT_BAD_INPUT, Processes, RayAddress, check_seed_options, plain_errors
+from companion.cli.flags import Processes, RayAddress, check_seed_options, plain_errors
 
 
 def train_policy(
@@ -27,12 +27,9 @@ def train_policy(
 ) -> None:
     """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
     check_seed_options(context)
-    try:
-        from companion.guidance.policy_file import PolicyError
-        from companion.train_policy import PolicyTrainingError, Training, train_policies, train_policy
-    except ModuleNotFoundError as error:
-        typer.echo(f"companion: train-policy: {error}: pip install 'mavlink-companion[rl]'", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from error
+    from companion.guidance.policy_file import PolicyError
+    from companion.train_policy import PolicyTrainingError, Training, train_policies, train_policy
+
     with plain_errors(PolicyTrainingError, PolicyError, ClusterError, SeedError, ValueError, OSError):
         if seeds is None:
             _report(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
+from vision.extras import install_command
 
 if TYPE_CHECKING:
     import httpx
@@ -60,9 +61,7 @@ def endpoint_of(url: str, model: str, *, key: str | None = None, timeout_s: floa
     try:
         import ollama  # noqa: F401
     except ImportError as error:
-        raise LanguageError(
-            f"a language model needs the extra `llm`: pip install '.[llm]' ({error})"
-        ) from None
+        raise LanguageError(f"a language model needs ollama: {install_command('ollama')} ({error})") from None
     kind = OpenAIEndpoint if url.rstrip("/").endswith("/v1") else OllamaEndpoint
     return kind(url.rstrip("/"), model, key, timeout_s)
 

@@ -10,10 +10,8 @@ from vision.catalog import KNOWN, known_by_digest
 from vision.detector import Detector
 from vision.model_files import kept_models
 from vision.runtimes.selection import RuntimeChoice
-from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.checkpoint import load_checkpoint
+from vision.weights import DEFAULT_EXPORT
 from vision.yolo.checkpoint_pair import is_pair, pair_paths, weights_sha256
-from vision.yolo.published import describe
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +64,10 @@ def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice | None 
     """
     if image_size < 32 or image_size % 32:
         raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
+    # They import torch.
+    from vision.yolo.checkpoint import load_checkpoint
+    from vision.yolo.published import describe
+
     loaded = load_checkpoint(path)
     weights = pair_paths(path)[0] if is_pair(path) else path
     digest = weights_sha256(path)
@@ -129,10 +131,10 @@ def list_rows(folder: Path) -> list[dict[str, Any]]:
         {
             "name": "default",
             "state": "bundled",
-            "size_bytes": DEFAULT_WEIGHTS.stat().st_size if DEFAULT_WEIGHTS.is_file() else None,
+            "size_bytes": DEFAULT_EXPORT.stat().st_size if DEFAULT_EXPORT.is_file() else None,
             "licence": "Apache-2.0",
             "about": "the model of this package, for rendered scenes",
-            "path": str(DEFAULT_WEIGHTS),
+            "path": str(DEFAULT_EXPORT),
         }
     ]
     for model in KNOWN.values():

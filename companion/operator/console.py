@@ -9,10 +9,9 @@ import sys
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
-from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
-
 from companion.operator.reply_text import reply_text
 from companion.tasks import spawn
+from vision.extras import missing_module
 
 logger = logging.getLogger(__name__)
 
@@ -52,10 +51,13 @@ async def run_console(
     A command runs while the next is typed.
 
     Answers go to standard error, which must not wait for its reader (`line_output.py`).
+    Without aioconsole there is no console, and the service goes on.
     Never raises: an error of the console must not affect the flight.
     """
     try:
         await _read_commands(command, quit_service, help_text, ask)
+    except ModuleNotFoundError as error:
+        _print(f"no commands on this terminal: {missing_module(error) or error}; or use `companion send`")
     except Exception as error:
         logger.exception("the console failed")
         on_event("warning", f"console ended: {type(error).__name__}: {error}")
@@ -67,6 +69,9 @@ async def _read_commands(
     help_text: str,
     ask: Ask | None,
 ) -> None:
+    # Of the extra `console`.
+    from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
+
     _print(_BANNER)
     if ask is not None:
         _print(_ASK_BANNER)

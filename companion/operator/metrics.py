@@ -10,6 +10,8 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from vision.extras import install_command
+
 if TYPE_CHECKING:
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
@@ -44,7 +46,7 @@ class MetricsServer:
             from companion.operator.wsgi_server import open_server
         except ImportError as error:
             raise MetricsError(
-                "metrics.listen needs prometheus_client: pip install 'mavlink-companion[metrics]'"
+                f"metrics.listen needs prometheus_client: {install_command('prometheus_client')}"
             ) from error
         host, _, port = listen.rpartition(":")
         registry = CollectorRegistry()

@@ -15,6 +15,7 @@ from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.recording import RecordingError
 from companion.settings import ZenohSection
+from vision.extras import missing_module
 
 _RETRY_S = 2.0
 
@@ -27,11 +28,10 @@ def main(argument: str) -> int:
     on_parent_end(ending.set)
     values = json.loads(argument)
     zenoh = settings_in_child(values.pop("zenoh"))
-    extra = "foxglove" if "listen" in values else "recording"
     try:
         if not _wait_for_node(zenoh, ending):
             return 0
-        if extra == "foxglove":
+        if "listen" in values:
             from companion.recording.live import LiveOptions, serve
 
             serve(LiveOptions(zenoh=zenoh, **values), ending, _say)
@@ -40,7 +40,7 @@ def main(argument: str) -> int:
 
             record(RecorderOptions(zenoh=zenoh, **values), ending, _say, patient=True)
     except ModuleNotFoundError as error:
-        _say(f"{error}: pip install 'mavlink-companion[{extra}]'")
+        _say(missing_module(error) or str(error))
         return EXIT_REFUSED
     except (RecordingError, NoAnswerError, BusError) as error:
         _say(str(error))

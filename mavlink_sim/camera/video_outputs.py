@@ -32,6 +32,7 @@ from urllib.parse import urlsplit
 import cv2
 
 from vision.camera_model import CameraCalibration
+from vision.extras import install_command
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameWriter, segment_path
 
@@ -56,7 +57,7 @@ class RtpOutput:
             import av
         except ModuleNotFoundError as error:
             raise ModuleNotFoundError(
-                "sending H.264 needs PyAV: pip install 'mavlink-companion[rtp]'", name="av"
+                f"sending H.264 needs PyAV: {install_command('av')}", name="av"
             ) from error
         if "libx264" not in av.codecs_available:
             raise ModuleNotFoundError(

@@ -10,10 +10,12 @@
 
 from __future__ import annotations
 
+from vision.extras import missing_module
+
 try:
     import gymnasium
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError(f"{error}: pip install 'mavlink-companion[rl]'", name=error.name) from None
+    raise ModuleNotFoundError(missing_module(error) or str(error), name=error.name) from None
 
 from mavlink_sim.environments.gym_env import TASKS, TaskEnv, TaskVectorEnv
 

@@ -15,6 +15,8 @@ from companion.guidance.missions.mission_file import MISSIONS_FOLDER
 from companion.sim_session import MISSION
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.command_line import QUICK
+from tests.companion.plain_installation import environment_without
+from vision.extras import EXTRA_OF
 
 URL_LIMIT_S = 150
 FLOWN = "mission demo: flown, "  # 5 steps, or more where the car was sought again
@@ -46,7 +48,7 @@ QUICK_STEPS = {
 
 
 def demo(output: Path, *flags: str, quick: bool = False) -> subprocess.CompletedProcess[str]:
-    """`companion demo` as a process of its own."""
+    """`companion demo` as a process of its own, without the extras; but for a quick encoder of the video."""
     program = ("-c", QUICK_DEMO) if quick else ("-m", "companion.cli")
     if quick:
         # A mission file of this name in the working directory comes before the bundled one. The slow case
@@ -59,6 +61,7 @@ def demo(output: Path, *flags: str, quick: bool = False) -> subprocess.Completed
     return subprocess.run(
         [sys.executable, *program, "demo", "--output", str(output), *flags],
         cwd=output.parent,
+        env=environment_without(output.parent / "hidden", EXTRA_OF.keys() - {"av"}),
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

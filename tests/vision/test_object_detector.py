@@ -154,6 +154,6 @@ def test_kind_that_opens_no_detector_is_named(opened: object, got: str) -> None:
 def test_yolo_is_a_registered_kind() -> None:
     made = open_detector(YOLO, DetectorSettings(confidence=0.5, image_size=64, precision="float32"))
     assert isinstance(made, Detector)
-    assert (made.model_name, made.runtime, made.precision) == ("default", "torch", "float32")
+    assert (made.model_name, made.runtime, made.precision) == ("default", "onnxruntime", "float32")
     assert (made.confidence, made.image_size) == (0.5, 64)
     assert made.reason

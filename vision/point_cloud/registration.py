@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.extras import install_command
 from vision.point_cloud.cloud import PointCloud
 
 Method = Literal["icp", "plane_icp", "gicp"]
@@ -71,7 +72,7 @@ def align(
         import small_gicp
     except ModuleNotFoundError as error:
         raise RegistrationError(
-            "alignment of point clouds needs small-gicp: pip install 'mavlink-companion[cloud]'"
+            f"alignment of point clouds needs small-gicp: {install_command('small_gicp')}"
         ) from error
     reduced = []
     for name, cloud in (("source", source), ("target", target)):

@@ -13,6 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.extras import install_command
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 RuntimeName = Literal["torch", "onnxruntime", "openvino", "tensorrt"]
@@ -95,15 +96,14 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
             found = False
         if not found:
             raise RuntimeMissingError(
-                f"the runtime {runtime} is not installed ({package} is missing): "
-                f"pip install 'mavlink-companion[{runtime}]'"
+                f"the runtime {runtime} is not installed ({package} is missing): {install_command(package)}"
             )
     try:
         return _import_openvino() if runtime == "openvino" else importlib.import_module(runtime)
     except ImportError as error:
         raise RuntimeMissingError(
             f"the runtime {runtime} is installed but cannot be loaded: {error}; "
-            f"reinstall it: pip install --force-reinstall 'mavlink-companion[{runtime}]'"
+            f"reinstall it: {install_command(runtime)} --force-reinstall"
         ) from error
 
 

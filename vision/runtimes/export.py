@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vision.extras import install_command
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, SUFFIXES, ExportedFacts, ExportKind, with_facts
 from vision.runtimes.network import Network
@@ -154,9 +155,7 @@ def _write_onnx(network: Network, facts: ExportedFacts, path: Path) -> None:
     try:
         import onnx
     except ImportError as error:
-        raise RuntimeMissingError(
-            "exporting needs the package onnx: pip install 'mavlink-companion[onnxruntime]', or [tensorrt]"
-        ) from error
+        raise RuntimeMissingError(f"exporting needs the package onnx: {install_command('onnx')}") from error
     with _without_warnings():
         example = _example(facts.image_size)
         graph: Any = traced(network, example)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.evaluation.datasets import image_files, read_image
+from vision.extras import install_command
 from vision.letterbox import fit
 from vision.runtimes.base import RuntimeMissingError, RuntimeUnusableError
 from vision.runtimes.exported import INPUT, ExportKind
@@ -72,8 +73,7 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
         from onnxruntime import quantization
     except ImportError as error:
         raise RuntimeMissingError(
-            f"exporting to int8 needs the packages onnx and onnxruntime ({error}): "
-            "pip install 'mavlink-companion[onnxruntime]'"
+            f"exporting to int8 needs the packages onnx and onnxruntime ({error}): {install_command('onnx')}"
         ) from error
 
     class Reader(quantization.CalibrationDataReader):  # type: ignore[misc]

@@ -6,9 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vision.extras import install_command
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.model_files import missing_model_advice
-from vision.runtimes.base import Precision, Runtime, RuntimeName, RuntimeUnusableError, installed
+from vision.runtimes.base import (
+    Precision,
+    Runtime,
+    RuntimeMissingError,
+    RuntimeName,
+    RuntimeUnusableError,
+    installed,
+    required,
+)
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
 from vision.yolo.level_outputs import Head
 from vision.yolo.safe_pickle import CheckpointError
@@ -84,7 +93,7 @@ def read_source(path: Path) -> ModelSource:
 
     Raises:
         CheckpointError: a checkpoint that cannot be read, or a name that is not UTF-8.
-        RuntimeMissingError: an exported file, and no runtime that reads it is installed.
+        RuntimeMissingError: a checkpoint without torch, or an exported file without a runtime that reads it.
         RuntimeUnusableError: an exported file that is damaged or has no metadata.
     """
     if path.is_dir():
@@ -97,6 +106,11 @@ def read_source(path: Path) -> ModelSource:
     if kind is None:
         if not path.exists():  # checked before torch is imported
             raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}")
+        if not installed("torch"):
+            raise RuntimeMissingError(
+                f"{path}: reading a checkpoint needs torch: {install_command('torch')}; or give an export "
+                "of it, which `companion models export` writes where torch is installed"
+            )
         if path.suffix == YOLOX_SUFFIX:
             from vision.foreign.yolox import load_yolox
 
@@ -127,6 +141,7 @@ def read_source(path: Path) -> ModelSource:
 
 def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
     if kind == "torchscript":
+        required("torch")
         from vision.runtimes.torch_runtime import torchscript_facts
 
         return torchscript_facts(path)

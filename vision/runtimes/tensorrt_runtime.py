@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.extras import install_command
 from vision.runtimes.base import Precision, RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, ExportedFacts, split_facts
 from vision.yolo.level_outputs import Head, LevelOutput, Product
@@ -162,7 +163,7 @@ class _Cuda:
             self._api: Any = importlib.import_module(_CUDA)
         except ImportError as error:
             raise RuntimeMissingError(
-                f"{_CUDA} cannot be loaded ({error}): pip install 'mavlink-companion[tensorrt]'"
+                f"{_CUDA} cannot be loaded ({error}): {install_command(_CUDA)}"
             ) from error
         (self.stream,) = self._checked(self._api.cudaStreamCreate())
 

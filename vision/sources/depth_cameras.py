@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from vision.camera_model import CameraCalibration, CameraModel
+from vision.extras import install_command
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.depth_images import to_metres
 from vision.sources.source import SourceError, SourceSettings
@@ -38,11 +39,10 @@ def load_module(name: str, uri: str) -> Any:
     Raises:
         SourceError: it is not installed, or does not load.
     """
-    extra = {"pyrealsense2": "realsense", "depthai": "oak"}[name]
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise SourceError(f"{uri}: needs pip install 'mavlink-companion[{extra}]' ({error})") from error
+        raise SourceError(f"{uri}: needs {name}: {install_command(name)} ({error})") from error
 
 
 def _size(settings: SourceSettings) -> tuple[int, int]:

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.extras import install_command
 from vision.sources.source import SourceError
 
 DEPTH_SUFFIXES = frozenset((".png", ".pgm", ".tif", ".tiff", ".exr", ".npy"))
@@ -68,7 +69,7 @@ def _decode_exr(path: Path, data: bytes) -> NDArray[Any] | None:
         import OpenEXR
     except ImportError as error:
         raise SourceError(
-            f"{path}: OpenEXR needs pip install 'mavlink-companion[exr]' ({error}); or convert it to 32-bit "
+            f"{path}: needs OpenEXR: {install_command('OpenEXR')} ({error}); or convert it to 32-bit "
             f"TIFF or NPY"
         ) from error
     try:

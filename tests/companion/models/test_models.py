@@ -14,7 +14,9 @@ from typer.testing import CliRunner
 import companion.models.verify
 from companion.cli import app
 from vision.model_files import find_model, kept_models, models_folder
+from vision.weights import DEFAULT_EXPORT
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
+from vision.yolo.checkpoint_pair import weights_sha256
 
 
 @pytest.fixture(autouse=True)
@@ -80,7 +82,7 @@ def test_bare_name_is_found_in_models_folder(folder: Path, small_model: Path) ->
 
 
 def test_info_describes_model() -> None:
-    facts = json.loads(run("info", "default", "--json"))
+    facts = json.loads(run("info", "default", "--runtime", "torch", "--json"))
     assert facts["model_family"] == "YOLOv8"
     assert facts["licence"] == "Apache-2.0"
     assert facts["classes"][0] == "person"
@@ -91,11 +93,17 @@ def test_info_describes_model() -> None:
     assert facts["official"] is None
     assert facts["runtime"] == "torch"
     assert facts["precision"] in ("float32", "bfloat16")
-    output = run("info", "default")
+    output = run("info", "default", "--runtime", "torch")
     # It is measured again; with equal timings the choice may differ.
     assert re.search(r"\b(float32|bfloat16) \((measured|this processor)", output)
     assert "Apache-2.0" in output
     assert facts["sha256"] in output
+
+
+def test_info_of_the_bundled_model_is_that_of_its_export() -> None:
+    facts = json.loads(run("info", "default", "--json"))
+    assert (facts["kind"], facts["runtime"], facts["licence"]) == ("onnx", "onnxruntime", "Apache-2.0")
+    assert facts["sha256"] == weights_sha256(DEFAULT_EXPORT)
 
 
 def test_unknown_runtime_is_an_error() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import Any
@@ -110,6 +111,17 @@ async def test_sentences_and_their_answers_are_passed_on(
     assert service.asked == ["y", "hold", "vehicle2 stop", "ask"]
     assert sentences.closed
     assert "fly this? fly this? " in capsys.readouterr().err
+
+
+async def test_without_aioconsole_one_line_and_the_service_goes_on(
+    terminal: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "aioconsole.stream", None)
+    service = Service()
+    await service.run()
+    assert not service.stopped
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "'mavlink-companion[console]'" in line
 
 
 async def test_sentence_that_fails_leaves_the_console(

@@ -18,7 +18,7 @@ from companion.bus.topics import LARGE_TOPICS, TOPICS
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.bus.message_check import check_message, closed
 from tests.companion.service_process import running_service
-from vision.weights import DEFAULT_WEIGHTS
+from vision.weights import DEFAULT_EXPORT
 from vision.yolo.checkpoint_pair import weights_sha256
 
 pytestmark = pytest.mark.realtime
@@ -93,7 +93,7 @@ def test_every_message_of_a_flight_is_valid(tmp_path: Path) -> None:
     # `goto` flies what the worker has planned.
     assert any(body["path_ned_m"] for body in bodies["setpoint"])
     frames = [body for body in bodies["detections"] if body["camera"] is None]
-    assert {body["model_sha256"] for body in frames} == {weights_sha256(DEFAULT_WEIGHTS)}
+    assert {body["model_sha256"] for body in frames} == {weights_sha256(DEFAULT_EXPORT)}
     cars = [(body, car) for body in frames for car in body["detections"] if car["track_state"] == "confirmed"]
     assert cars
     located = [car for body, car in cars if car["position_ned_m"] and car["class_name"] == "car"]

@@ -38,7 +38,8 @@ def test_missing_runtime_names_its_extra(
     checkpoint: Path, monkeypatch: pytest.MonkeyPatch, runtime: RuntimeName
 ) -> None:
     only(monkeypatch, "torch")
-    with pytest.raises(RuntimeMissingError, match=rf"mavlink-companion\[{runtime}\]'"):
+    package = "onnxruntime$" if runtime == "onnxruntime" else rf"'mavlink-companion\[{runtime}\]'$"
+    with pytest.raises(RuntimeMissingError, match=rf"pip install {package}"):
         Detector(checkpoint, image_size=96, runtime=runtime)
     with pytest.raises(RuntimeMissingError, match=runtime):
         runtime_of_file(runtime, checkpoint)

@@ -1,0 +1,214 @@
+"""Without the extras: every command works, or says in one line which extra it needs."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+
+from companion.cli import app
+from tests.companion.plain_installation import environment_without
+from vision.extras import EXTRA_OF, install_command, missing_module
+
+ROOT = Path(__file__).parents[3]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+# What may need the module of an extra when it is imported. Nothing that flies is in it.
+OPTIONAL = {
+    "torch": (
+        "companion.train",
+        "vision.foreign.yolox",
+        "vision.runtimes.export",
+        "vision.runtimes.network",
+        "vision.runtimes.torch_runtime",
+        "vision.yolo.",
+    ),
+    "mcap": (
+        "companion.collect",
+        "companion.flight_log",
+        "companion.recording.",
+        "companion.replay",
+        "companion.sightings",
+    ),
+    "foxglove": ("companion.recording.live",),
+    "gymnasium": ("companion.train_policy", "mavlink_sim.environments"),
+    "mcp_types": ("companion.language.mcp_server",),
+    "pyulog": ("companion.recording.ulog",),
+}
+NOBODY = ("--connect", "tcp/127.0.0.1:1")  # where no service answers
+ENDS = ""  # ends, with output or one line of its own
+# (command, arguments, extra that its one line names). A command may be in it several times.
+WALK: list[tuple[str, tuple[str, ...], str]] = [
+    ("run", ("--vehicle-url", "bad"), ENDS),
+    ("play", ("--autopilot", "none"), ENDS),
+    ("demo", ("--seeds", "2..1"), ENDS),
+    ("detect", ("demo.png", "--image-size", "320"), ENDS),
+    ("detect", ("demo.png", "--model", "old.pt"), "torch"),
+    ("detect", ("demo.png", "--runtime", "torch"), "torch"),
+    ("detect", ("demo.png", "--runtime", "openvino"), "openvino"),
+    ("detect", ("demo.png", "--runtime", "tensorrt"), "torch"),
+    ("detect", ("demo.png", "--runtime", "auto", "--image-size", "320"), ENDS),
+    ("send", ("land", *NOBODY), ENDS),
+    ("echo", ("detections", *NOBODY), ENDS),
+    ("ask", ("land", *NOBODY), ENDS),
+    ("ask", ("land", *NOBODY, "--language-model", "small"), "llm"),
+    ("mcp", NOBODY, "mcp"),
+    ("cameras", (), ENDS),
+    ("preview", ("demo.png",), ENDS),
+    ("depth", ("demo.png",), ENDS),
+    ("dashboard", ("--dashboard-listen", "bad"), ENDS),
+    ("commands", (), ENDS),
+    ("topics", (), ENDS),
+    ("mission", ("demo",), ENDS),
+    ("cloud", ("none.ply", "out.ply"), ENDS),
+    ("record", ("recordings", *NOBODY), "recording"),
+    ("replay", ("flight.mcap",), "recording"),
+    ("sightings", ("flight.mcap", "--kml", "out.kml"), "recording"),
+    ("config", (), ENDS),
+    ("collect", ("images", "flight.mcap"), "recording"),
+    ("evaluate", ("labelled", "--image-size", "320"), ENDS),
+    ("evaluate", ("labelled", "--runtime", "torch"), "torch"),
+    ("train", ("--data", "labelled"), "torch"),
+    ("train-policy", ("companion/CartPole-v0",), "rl"),
+    ("models list", (), ENDS),
+    ("models info", ("default",), ENDS),
+    ("models info", ("old.pt",), "torch"),
+    ("models pull", ("none",), ENDS),
+    ("models export", ("default", "--to", "onnx"), "torch"),
+    ("models verify", ("default", "none.onnx"), "torch"),
+    ("calibrate lens", ("none", "--board", "chessboard", "10x7", "--square", "0.02"), ENDS),
+    ("calibrate extrinsics", ("none", "none"), ENDS),
+    ("calibrate mount", ("none", "--marker", "4X4_50"), ENDS),
+    ("markers detect", ("demo.png", "--dictionary", "4X4_50"), ENDS),
+    ("markers print", ("--help",), ENDS),
+    ("bench detector", ("--frames", "5", "--image-size", "320"), ENDS),
+    ("bench latency", ("--driver", "none"), ENDS),
+    ("bench setpoints", ("--seconds", "1", "--load", "0"), ENDS),
+    ("bench bus", ("--seconds", "0"), ENDS),
+    ("bench deadman", ("--runs", "0"), ENDS),
+    ("log list", (".",), "recording"),
+    ("log show", ("flight.mcap",), "recording"),
+    ("log recover", ("flight.mcap", "out.mcap"), "recording"),
+    ("log tlog", ("flight.mcap", "out.tlog"), "recording"),
+    ("log ulog", ("flight.mcap", "flight.ulg", "--output", "out.mcap"), "recording"),
+]
+# All in one process, to which each command's imports are new only once.
+CHILD = """
+import json, sys
+from typer.testing import CliRunner
+from companion.cli.commands import app
+for arguments in json.loads(sys.argv[1]):
+    done = CliRunner().invoke(app, arguments)
+    failed = None if isinstance(done.exception, SystemExit | None) else repr(done.exception)
+    print(json.dumps([done.exit_code, done.stdout, done.stderr, failed]), flush=True)
+"""
+
+
+def commands(command: Any, name: str = "") -> Iterator[str]:
+    """Every command with its group."""
+    if not hasattr(command, "commands"):
+        yield name
+        return
+    for word, part in command.commands.items():
+        yield from commands(part, f"{name} {word}".strip())
+
+
+def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tuple[str, ...], str]]) -> Any:
+    """Run the commands in a folder with an image, a checkpoint, a recording and a labelled set."""
+    shutil.copy(ROOT / "docs/images/demo.png", folder)
+    (folder / "labelled").mkdir()
+    shutil.copy(ROOT / "docs/images/demo.png", folder / "labelled")
+    (folder / "labelled" / "demo.txt").write_text("2 0.5 0.5 0.2 0.2\n")
+    for name in ("old.pt", "flight.mcap"):
+        (folder / name).touch()
+    given = json.dumps([[*command.split(), *arguments] for command, arguments, _ in walk])
+    path = os.pathsep.join((environment["PYTHONPATH"], str(ROOT)))
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, given],
+        cwd=folder,
+        env=environment | {"PYTHONPATH": path},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    results = [json.loads(line) for line in done.stdout.splitlines()]
+    assert len(results) == len(walk), done.stderr
+    return results
+
+
+def test_walk_has_every_command() -> None:
+    assert {command for command, _, _ in WALK} == set(commands(typer.main.get_command(app)))
+
+
+@pytest.mark.timeout(300)
+def test_every_command_works_or_names_its_extra(tmp_path: Path) -> None:
+    (tmp_path / "work").mkdir()
+    results = walked(tmp_path / "work", environment_without(tmp_path / "hidden"), WALK)
+    wrong = []
+    for (command, arguments, extra), (code, output, errors, failed) in zip(WALK, results, strict=True):
+        lines = errors.splitlines()
+        if extra:
+            good = code == 2 and len(lines) == 1 and f"'mavlink-companion[{extra}]'" in errors
+        else:
+            good = code in (0, 2) and "mavlink-companion[" not in errors and (output or errors)
+        if failed is not None or not good:
+            wrong.append(f"{command} {' '.join(arguments)}: {code} {failed} {errors[-500:]}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_only_listed_modules_need_an_extra(tmp_path: Path) -> None:
+    """Imported alone each: what flies imports none of them."""
+    code = """
+import importlib, json, pkgutil
+missing = {}
+for package in ("companion", "mavlink_sim", "vision"):
+    path = importlib.import_module(package).__path__
+    for module in pkgutil.walk_packages(path, f"{package}.", lambda _: None):
+        try:
+            if not module.name.endswith("__main__"):
+                importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            missing[module.name] = error.name.partition(".")[0]
+print(json.dumps(missing))
+"""
+    environment = environment_without(tmp_path / "hidden")
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True, check=True
+    )
+    missing = json.loads(done.stdout)
+    assert missing["vision.yolo.checkpoint"] == "torch"
+    assert not {
+        name: module for name, module in missing.items() if not name.startswith(OPTIONAL.get(module, ()))
+    }
+
+
+def test_table_of_extras_is_that_of_the_project() -> None:
+    extras = PROJECT["optional-dependencies"]
+    assert set(EXTRA_OF.values()) <= set(extras)
+    for module, extra in EXTRA_OF.items():
+        assert install_command(f"{module}.part") == f"pip install 'mavlink-companion[{extra}]'"
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (ModuleNotFoundError(name="torch"), "torch is not installed: pip install 'mavlink-companion[torch]'"),
+        (
+            ModuleNotFoundError(name="mcp.server"),
+            "mcp.server is not installed: pip install 'mavlink-companion[mcp]'",
+        ),
+        (ModuleNotFoundError(name="companion.none"), None),
+        (ImportError(name="torch"), None),  # is installed, and does not load
+    ],
+)
+def test_line_of_a_missing_module(error: ImportError, line: str | None) -> None:
+    assert missing_module(error) == line
