@@ -242,7 +242,8 @@ class MarkerTracker:
         """Return the markers of the cameras that look down, for behaviours."""
         if not self._detecting:
             return MarkerSight()
-        down = [seen for seen in self._seen.values() if seen.looks_down]
+        down_of = {name: seen for name, seen in self._seen.items() if seen.looks_down}
+        down = list(down_of.values())
         if self._seen and not down:
             return MarkerSight(missing=self._no_camera_below())
         if not down:
@@ -251,7 +252,8 @@ class MarkerTracker:
         age_s = (now_ns - newest_ns) / 1e9
         fresh = [seen for seen in down if now_ns - seen.captured_ns <= max_age_s * 1e9]
         targets = tuple(target for seen in fresh for target in seen.targets)
-        frozen = [why for camera in self._detecting if (why := camera.frozen(now_ns))]
+        looking = [camera for camera in self._detecting if camera.name in down_of]
+        frozen = [why for camera in looking if (why := camera.frozen(now_ns))]
         return MarkerSight(targets, newest_ns, age_s, bool(fresh), "", "; ".join(frozen))
 
     def _no_camera_below(self) -> str:

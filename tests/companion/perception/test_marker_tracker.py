@@ -138,6 +138,23 @@ def test_marker_seen_twice_in_a_frame_is_refused(flight: Flight) -> None:
     assert [target.identifier for target in flight.tracker.sight(flight.now_ns, 0.5).targets] == [5]
 
 
+@pytest.mark.parametrize("frozen", ["forward", "down"])
+def test_fault_below_is_that_of_a_camera_that_looks_down(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frozen: str
+) -> None:
+    flight, forward = Flight(tmp_path), PerceptionCamera(Flight(tmp_path, 0.0).camera.settings, "forward")
+    down = flight.camera
+    flight.tracker = MarkerTracker([down, forward], lambda *event: None)
+    for camera in (forward, down):
+        flight.camera = camera
+        flight.frame([])
+    monkeypatch.setattr({"forward": forward, "down": down}[frozen], "frozen", lambda now_ns: "frozen")
+    assert flight.tracker.sight(flight.now_ns, 0.5).fault == ("frozen" if frozen == "down" else "")
+    assert flight.tracker.steering_sight(forward, flight.now_ns, 0.5).fault == (
+        "frozen" if frozen == "forward" else ""
+    )
+
+
 def test_landing_on_a_marker_needs_a_camera_down(tmp_path: Path) -> None:
     def refused(pitch_deg: float) -> str:
         flight = Flight(tmp_path, pitch_deg)
