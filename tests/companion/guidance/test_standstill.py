@@ -273,6 +273,7 @@ def test_command_without_a_heartbeat_is_answered(newer: type[HoldBehaviour] | ty
     harness.stand_still(1.0, suspended=True)
     harness._inputs = SilentUntilReceived()
     pending = harness.command(StopBehaviour())
+    harness.run(1.1)  # until then only commands that end a flight are accepted
     second = harness.command(newer())
     assert "superseded" in pending.result().reason
     harness.run(5.0)
