@@ -1,10 +1,10 @@
-"""Background tasks: none ends unseen."""
+"""Tasks: background ones that do not end unseen, and some that begin and end together."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Iterable
 from typing import Any, TypeVar
 
 logger = logging.getLogger(__name__)
@@ -29,3 +29,32 @@ def _on_end(task: asyncio.Task[Any]) -> None:
     _running.discard(task)
     if not task.cancelled() and (error := task.exception()) is not None:
         logger.error("%s has ended: %s: %s", task.get_name(), type(error).__name__, error, exc_info=error)
+
+
+async def start_together(*starts: Coroutine[Any, Any, None]) -> None:
+    """Run coroutines at the same time until all have ended.
+
+    The first that fails cancels the others, and its error is raised once they have ended.
+    """
+    tasks = [asyncio.create_task(start) for start in starts]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
+        for task in done:
+            task.result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def run_until(stop: asyncio.Event, tasks: Iterable[asyncio.Task[None]]) -> None:
+    """Wait until `stop` is set. A task that fails ends this with its error; one may end without."""
+    stopped = asyncio.create_task(stop.wait())
+    waiting: set[asyncio.Task[Any]] = {stopped, *tasks}
+    try:
+        while not stopped.done():
+            done, waiting = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
+    finally:
+        stopped.cancel()

@@ -131,7 +131,6 @@ AWAITED_TASKS = {
     "companion/play.py",
     "companion/service/ending.py",
     "companion/service/service.py",
-    "companion/service/tasks.py",
     "companion/sim_session.py",
     "companion/tasks.py",
 }

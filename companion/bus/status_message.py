@@ -25,7 +25,7 @@ from companion.perception.supervisor import PerceptionSupervisor
 from companion.vehicle.autopilot_parameters import AutopilotParameters
 from companion.vehicle.driver import Driver
 from companion.vehicle.gimbal import address_text
-from companion.vehicle.silence import silence_outcome
+from companion.vehicle.setpoint_loss import setpoint_loss_outcome
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
@@ -56,7 +56,7 @@ def status_message(
             same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
     state, limits = driver.state, guidance.limits
-    silence = silence_outcome(parameters, sticks_present=state.sticks_present)
+    silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
     return {
         "stamp_ns": now_ns,
         "service": poses.source,

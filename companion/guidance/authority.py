@@ -230,7 +230,7 @@ class Authority:
         return accepted and state.autopilot == "PX4" and self._holds_after_takeoff(state, now_ns)
 
 
-def silence(stream: StreamState, paused_s: float) -> str | None:
+def stream_interruption(stream: StreamState, paused_s: float) -> str | None:
     """Why the setpoint stream was interrupted; None: it was not. `paused_s`: since the previous step.
 
     PX4 would resume OFFBOARD by itself if setpoints came back; only an operator may.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from enum import StrEnum
 
-from companion.guidance.authority import Authority, silence
+from companion.guidance.authority import Authority, stream_interruption
 from companion.guidance.behaviour import BehaviourContext, ModeRequest
 from companion.guidance.interface import Answer, Arm, Disarm, GuidanceInput, OutputCollector, SetMode, TakeOff
 from companion.guidance.setpoint_output import SetpointOutput
-from companion.vehicle.silence import silence_outcome
+from companion.vehicle.setpoint_loss import setpoint_loss_outcome
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import StreamState
 
@@ -99,9 +99,11 @@ class ModeControl:
         stream = inputs.stream.state
         interrupted = None
         if self._setpoints.streaming:
-            interrupted = silence(stream, paused_s)
+            interrupted = stream_interruption(stream, paused_s)
             if stream is StreamState.EXPIRED and interrupted is not None:
-                outcome = silence_outcome(inputs.parameters, sticks_present=context.state.sticks_present)
+                outcome = setpoint_loss_outcome(
+                    inputs.parameters, sticks_present=context.state.sticks_present
+                )
                 interrupted = f"{interrupted}: {outcome.text}"
         active = stream is StreamState.FRESH and self.phase is Phase.OFFBOARD
         return interrupted or self._authority.lost(

@@ -21,7 +21,7 @@ from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
-from companion.vehicle.silence import silence_outcome
+from companion.vehicle.setpoint_loss import setpoint_loss_outcome
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 
@@ -144,7 +144,7 @@ class GuidanceLoop:
                 await self._driver.settle()
             except CommandRefusedError as error:
                 sticks = self._driver.state.sticks_present
-                outcome = silence_outcome(self._inputs.parameters, sticks_present=sticks)
+                outcome = setpoint_loss_outcome(self._inputs.parameters, sticks_present=sticks)
                 self._on_event("error", f"shutdown: {error}; {outcome.text}")
             finally:
                 await self.wait_released()

@@ -13,7 +13,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, parameter_names
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
-from companion.vehicle.silence import SilenceOutcome, silence_outcome
+from companion.vehicle.setpoint_loss import SetpointLossOutcome, setpoint_loss_outcome
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vehicle_type import VTOL_STATE_MISSING
 
@@ -52,12 +52,14 @@ class Health:
         self._not_flown: str | None = None
         self._link_count = 0
         self._check_due = asyncio.Event()
-        self._silence_of: tuple[AutopilotParameters, bool] | None = None
+        self._setpoint_loss_of: tuple[AutopilotParameters, bool] | None = None
 
     @property
-    def silence(self) -> SilenceOutcome:
+    def setpoint_loss(self) -> SetpointLossOutcome:
         """What the autopilot does without setpoints."""
-        return silence_outcome(self._inputs.parameters, sticks_present=self._driver.state.sticks_present)
+        return setpoint_loss_outcome(
+            self._inputs.parameters, sticks_present=self._driver.state.sticks_present
+        )
 
     def healthy(self, now_ns: int) -> bool:
         """Whether every camera delivers results, and the autopilot, if one is expected, is connected."""
@@ -95,14 +97,14 @@ class Health:
             self._on_event("warning", f"{error}: not assumed; what depends on it is reported as not known")
             return None
 
-    def _report_silence(self) -> None:
+    def _report_setpoint_loss(self) -> None:
         """Report what the autopilot does without setpoints, again whenever it changes."""
         read, state = self._inputs.parameters, self._driver.state
         sticks = state.sticks_present
-        if read.autopilot is None or state.not_flown is not None or (read, sticks) == self._silence_of:
+        if read.autopilot is None or state.not_flown is not None or (read, sticks) == self._setpoint_loss_of:
             return
-        self._silence_of = (read, sticks)
-        outcome = self.silence
+        self._setpoint_loss_of = (read, sticks)
+        outcome = self.setpoint_loss
         self._on_event("warning" if outcome.warning else "info", outcome.text)
 
     def after_step(self, now_ns: int, guidance: Guidance) -> None:
@@ -110,9 +112,9 @@ class Health:
         if self._driver.link_count != self._link_count:
             self._link_count = self._driver.link_count
             self._inputs.parameters = NOTHING_READ  # they may have been changed meanwhile
-            self._silence_of = None
+            self._setpoint_loss_of = None
             self._check_due.set()
-        self._report_silence()
+        self._report_setpoint_loss()
         # Until the driver has connected, the heartbeat may be that of an autopilot that it does not support.
         found = self._driver.link_count > 0
         linked = found and self._driver.state.connected(now_ns)
@@ -131,7 +133,7 @@ class Health:
             self._others.watch(
                 self._driver.state,
                 now_ns,
-                self.silence,
+                self.setpoint_loss,
                 in_command=guidance.in_command,
                 exact_echo=self._inputs.parameters.exact_echo,
             )

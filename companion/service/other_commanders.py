@@ -20,7 +20,7 @@ from companion.guidance.limits.battery import needs_charge
 from companion.peer_data import PeerDataError, parse_object
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.gimbal import Address, address_text
-from companion.vehicle.silence import SilenceEffect, SilenceOutcome
+from companion.vehicle.setpoint_loss import SetpointLossEffect, SetpointLossOutcome
 from companion.vehicle.state import FlightMode, VehicleState
 
 FOREIGN_COMMAND = "commands with our own address"
@@ -144,7 +144,7 @@ class OtherCommanders:
         self,
         state: VehicleState,
         now_ns: int,
-        silence: SilenceOutcome,
+        setpoint_loss: SetpointLossOutcome,
         *,
         in_command: bool = False,
         exact_echo: bool = False,
@@ -152,15 +152,15 @@ class OtherCommanders:
         """Report services that have appeared or disappeared, once each; call it once a second.
 
         Args:
-            silence: what the autopilot does without setpoints.
+            setpoint_loss: what the autopilot does without setpoints.
             in_command: whether we are in command.
             exact_echo: whether the autopilot reports the setpoint that it follows as it was sent.
         """
         self._watch_address(state, now_ns)
         self._exact_echo = exact_echo
-        self._foreign_after_s = max(FOREIGN_OFFBOARD_S, (silence.after_s or 0.0) + LOSS_MARGIN_S)
+        self._foreign_after_s = max(FOREIGN_OFFBOARD_S, (setpoint_loss.after_s or 0.0) + LOSS_MARGIN_S)
         flies_setpoints = state.autopilot == "PX4" and state.mode is FlightMode.OFFBOARD and state.armed
-        if silence.effect is SilenceEffect.FLY_ON:  # in OFFBOARD it stays there without setpoints too
+        if setpoint_loss.effect is SetpointLossEffect.FLY_ON:  # it stays in OFFBOARD without setpoints
             flies_setpoints = False
         if in_command or not flies_setpoints or not state.connected(now_ns):
             self._offboard_since_ns = None

@@ -16,9 +16,9 @@ from companion.bus.session import Bus
 from companion.perception.cameras import WorkerCamera
 from companion.perception.status import PerceptionState
 from companion.perception.supervisor import PerceptionStartError
-from companion.service.tasks import start_together
 from companion.settings.perception import NO_SOURCE
 from companion.settings.vehicle import VehicleSection
+from companion.tasks import start_together
 from companion.vehicle.driver import Driver, LinkError
 
 AUTOPILOT, ZENOH = "autopilot", "zenoh"

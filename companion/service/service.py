@@ -33,8 +33,8 @@ from companion.service.parts import Parts
 from companion.service.publisher import Publisher
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
-from companion.service.tasks import run_until
 from companion.settings import Settings
+from companion.tasks import run_until
 from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult

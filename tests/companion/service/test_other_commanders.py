@@ -21,7 +21,7 @@ from companion.service.other_commanders import FOREIGN_OFFBOARD, FOREIGN_SETPOIN
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
 from companion.vehicle.commander import Commander, ForeignSetpoint
-from companion.vehicle.silence import SilenceOutcome, silence_outcome
+from companion.vehicle.setpoint_loss import SetpointLossOutcome, setpoint_loss_outcome
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import running_simulator
 from mavlink_sim.wire.setpoints import velocity_setpoint
@@ -45,13 +45,13 @@ class Here(OtherCommanders):
         self,
         state: VehicleState,
         now_ns: int,
-        silence: SilenceOutcome | None = None,
+        setpoint_loss: SetpointLossOutcome | None = None,
         *,
         in_command: bool = False,
         exact_echo: bool = True,
     ) -> None:
-        silence = silence or silence_outcome(NOTHING_READ, sticks_present=False)
-        super().watch(state, now_ns, silence, in_command=in_command, exact_echo=exact_echo)
+        setpoint_loss = setpoint_loss or setpoint_loss_outcome(NOTHING_READ, sticks_present=False)
+        super().watch(state, now_ns, setpoint_loss, in_command=in_command, exact_echo=exact_echo)
 
     def reason(
         self, state: VehicleState, behaviour: Behaviour | None = None, *, in_command: bool = False
@@ -197,11 +197,11 @@ def test_offboard_counts_where_px4_would_have_left_it(
 ) -> None:
     known = tuple((PX4_VALUES | parameters).items())
     read = AutopilotParameters("PX4", FirmwareVersion(1, 18), 1, known)
-    silence = silence_outcome(read, sticks_present=sticks_present)
+    setpoint_loss = setpoint_loss_outcome(read, sticks_present=sticks_present)
     here = Here()
     for second in range(60):
         now_ns = NOW_NS + second * S
-        here.watch(offboard(now_ns), now_ns, silence)
+        here.watch(offboard(now_ns), now_ns, setpoint_loss)
         noticed = noticed_after_s is not None and second >= noticed_after_s
         assert bool(here.present(offboard(now_ns), now_ns)) is noticed, second
 

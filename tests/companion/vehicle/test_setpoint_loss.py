@@ -17,7 +17,7 @@ from companion.vehicle.autopilot_parameters import (
     parameter_names,
 )
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.silence import SilenceEffect, SilenceOutcome, silence_outcome
+from companion.vehicle.setpoint_loss import SetpointLossEffect, SetpointLossOutcome, setpoint_loss_outcome
 from companion.vehicle.state import FlightMode
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.px4.modes import Mode
@@ -35,8 +35,8 @@ def px4(version: str, **values: float) -> AutopilotParameters:
     return AutopilotParameters("PX4", FirmwareVersion(*numbers), 1, tuple(read.items()))
 
 
-def outcome(version: str, *, sticks: bool = False, **values: float) -> SilenceOutcome:
-    return silence_outcome(px4(version, **values), sticks_present=sticks)
+def outcome(version: str, *, sticks: bool = False, **values: float) -> SetpointLossOutcome:
+    return setpoint_loss_outcome(px4(version, **values), sticks_present=sticks)
 
 
 # --- flown with real autopilots -----------------------------------------------------------------------
@@ -45,21 +45,21 @@ def outcome(version: str, *, sticks: bool = False, **values: float) -> SilenceOu
 @pytest.mark.parametrize(
     ("version", "sticks", "values", "effect", "mode"),
     [
-        ("1.14.4", False, {}, SilenceEffect.SINK, FlightMode.POSITION),
-        ("1.16.2", False, {}, SilenceEffect.SINK, FlightMode.POSITION),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 1}, SilenceEffect.SINK, FlightMode.ALTITUDE),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 2}, SilenceEffect.DRIFT, FlightMode.STABILIZED),
-        ("1.16.2", True, {}, SilenceEffect.PILOT, FlightMode.POSITION),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 3}, SilenceEffect.RETURN, FlightMode.RETURN),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 4}, SilenceEffect.LAND, FlightMode.LAND),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 5}, SilenceEffect.HOLD, FlightMode.HOLD),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 6}, SilenceEffect.FALL, FlightMode.UNKNOWN),
-        ("1.16.2", False, {"COM_OBL_RC_ACT": 7}, SilenceEffect.FALL, FlightMode.UNKNOWN),
-        ("1.18.0", False, {}, SilenceEffect.RETURN, FlightMode.RETURN),
+        ("1.14.4", False, {}, SetpointLossEffect.SINK, FlightMode.POSITION),
+        ("1.16.2", False, {}, SetpointLossEffect.SINK, FlightMode.POSITION),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 1}, SetpointLossEffect.SINK, FlightMode.ALTITUDE),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 2}, SetpointLossEffect.DRIFT, FlightMode.STABILIZED),
+        ("1.16.2", True, {}, SetpointLossEffect.PILOT, FlightMode.POSITION),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 3}, SetpointLossEffect.RETURN, FlightMode.RETURN),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 4}, SetpointLossEffect.LAND, FlightMode.LAND),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 5}, SetpointLossEffect.HOLD, FlightMode.HOLD),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 6}, SetpointLossEffect.FALL, FlightMode.UNKNOWN),
+        ("1.16.2", False, {"COM_OBL_RC_ACT": 7}, SetpointLossEffect.FALL, FlightMode.UNKNOWN),
+        ("1.18.0", False, {}, SetpointLossEffect.RETURN, FlightMode.RETURN),
     ],
 )
 def test_outcome_is_what_a_real_px4_did(
-    version: str, sticks: bool, values: dict[str, float], effect: SilenceEffect, mode: FlightMode
+    version: str, sticks: bool, values: dict[str, float], effect: SetpointLossEffect, mode: FlightMode
 ) -> None:
     found = outcome(version, sticks=sticks, **values)
     assert (found.effect, found.mode) == (effect, mode)
@@ -82,28 +82,28 @@ def test_danger_delay_and_the_unknown_are_warnings() -> None:
 
 
 def test_nothing_read_is_unknown_and_a_warning() -> None:
-    found = silence_outcome(NOTHING_READ, sticks_present=False)
-    assert (found.effect, found.after_s, found.warning) == (SilenceEffect.UNKNOWN, None, True)
+    found = setpoint_loss_outcome(NOTHING_READ, sticks_present=False)
+    assert (found.effect, found.after_s, found.warning) == (SetpointLossEffect.UNKNOWN, None, True)
 
 
 @pytest.mark.parametrize("version", ["1.13.3", "1.19.0", "2.0.0"])
 def test_version_that_nobody_examined_is_unknown(version: str) -> None:
-    assert outcome(version).effect is SilenceEffect.UNKNOWN
-    assert outcome(version, COM_OBL_RC_ACT=5).effect is SilenceEffect.UNKNOWN
+    assert outcome(version).effect is SetpointLossEffect.UNKNOWN
+    assert outcome(version, COM_OBL_RC_ACT=5).effect is SetpointLossEffect.UNKNOWN
 
 
 def test_pre_releases_of_1_17_are_unknown_without_sticks() -> None:
     alpha = AutopilotParameters("PX4", FirmwareVersion.of(0x01110040), 1, tuple(PX4_DEFAULTS.items()))
-    assert silence_outcome(alpha, sticks_present=False).effect is SilenceEffect.UNKNOWN
-    assert silence_outcome(alpha, sticks_present=True).effect is SilenceEffect.PILOT
+    assert setpoint_loss_outcome(alpha, sticks_present=False).effect is SetpointLossEffect.UNKNOWN
+    assert setpoint_loss_outcome(alpha, sticks_present=True).effect is SetpointLossEffect.PILOT
 
 
 @pytest.mark.parametrize("missing", ["version", "COM_OF_LOSS_T", "COM_OBL_RC_ACT", "NAV_RCL_ACT"])
 def test_what_could_not_be_read_is_not_assumed(missing: str) -> None:
     values = tuple((name, value) for name, value in PX4_DEFAULTS.items() if name != missing)
     version = None if missing == "version" else FirmwareVersion(1, 18)
-    found = silence_outcome(AutopilotParameters("PX4", version, 1, values), sticks_present=False)
-    assert found.effect is SilenceEffect.UNKNOWN
+    found = setpoint_loss_outcome(AutopilotParameters("PX4", version, 1, values), sticks_present=False)
+    assert found.effect is SetpointLossEffect.UNKNOWN
     assert missing in found.text
 
 
@@ -113,14 +113,14 @@ def test_version_text_and_order() -> None:
     assert FirmwareVersion.of(0x011000C0) < FirmwareVersion.of(0x011000FF)
 
 
-def copter(minor: int = 5, **values: float) -> SilenceOutcome:
+def copter(minor: int = 5, **values: float) -> SetpointLossOutcome:
     version = FirmwareVersion(4, minor)
     read = {
         name: value
         for name, value in COPTER_DEFAULTS.items()
         if name in parameter_names("ArduPilot", version)
     }
-    return silence_outcome(
+    return setpoint_loss_outcome(
         AutopilotParameters("ArduPilot", version, 1, tuple({**read, **values}.items())), sticks_present=False
     )
 
@@ -128,7 +128,7 @@ def copter(minor: int = 5, **values: float) -> SilenceOutcome:
 def test_copter_flies_on_for_its_guided_timeout() -> None:
     long, short = copter(), copter(GUID_TIMEOUT=1)
     assert (long.effect, long.mode, long.after_s, long.warning) == (
-        SilenceEffect.HOLD,
+        SetpointLossEffect.HOLD,
         FlightMode.OFFBOARD,
         3.0,
         True,
@@ -179,7 +179,7 @@ def test_simulated_vehicle_does_what_the_function_says(
         driver.step(0.05)
     assert driver.state.mode is FlightMode.OFFBOARD
     assert driver.state.sticks_present is sticks
-    expected = silence_outcome(driver.parameters, sticks_present=driver.state.sticks_present)
+    expected = setpoint_loss_outcome(driver.parameters, sticks_present=driver.state.sticks_present)
     stopped_ns, left_ns = driver.now_ns - 50_000_000, 0
     heights = []
     for _ in range(60):
@@ -190,34 +190,34 @@ def test_simulated_vehicle_does_what_the_function_says(
     assert observed(vehicle, driver, heights, sticks=sticks) is expected.effect
     if expected.mode is not FlightMode.UNKNOWN:
         assert driver.state.mode is expected.mode
-        assert expected.after_s is not None or expected.effect is SilenceEffect.FLY_ON
+        assert expected.after_s is not None or expected.effect is SetpointLossEffect.FLY_ON
     if expected.after_s is not None and expected.mode is not FlightMode.UNKNOWN:
         assert (left_ns - stopped_ns) / 1e9 == pytest.approx(expected.after_s, abs=0.15)
 
 
 def observed(
     vehicle: LockstepVehicle, driver: SimulatedDriver, heights: list[float], *, sticks: bool
-) -> SilenceEffect:
+) -> SetpointLossEffect:
     """What a vehicle does that was at 12 m, 6 s after its last setpoint."""
     if min(heights) < 1.0:
-        return SilenceEffect.FALL
+        return SetpointLossEffect.FALL
     match driver.state.mode:
         case FlightMode.OFFBOARD:
             assert vehicle.truth.velocity_ned_mps[0] == pytest.approx(1.0, abs=0.3)
-            return SilenceEffect.FLY_ON
+            return SetpointLossEffect.FLY_ON
         case FlightMode.RETURN:
-            return SilenceEffect.RETURN
+            return SetpointLossEffect.RETURN
         case FlightMode.LAND:
-            return SilenceEffect.LAND
+            return SetpointLossEffect.LAND
         case FlightMode.HOLD:
             assert heights[-1] == pytest.approx(12.0, abs=0.5)
-            return SilenceEffect.HOLD
+            return SetpointLossEffect.HOLD
         case FlightMode.POSITION | FlightMode.ALTITUDE:
             sinks = heights[15] - heights[-1] > 2.0
             assert sinks or heights[-1] == pytest.approx(12.0, abs=0.5)
-            return SilenceEffect.SINK if sinks else SilenceEffect.PILOT
+            return SetpointLossEffect.SINK if sinks else SetpointLossEffect.PILOT
         case FlightMode.STABILIZED:
-            return SilenceEffect.PILOT if sticks else SilenceEffect.DRIFT
+            return SetpointLossEffect.PILOT if sticks else SetpointLossEffect.DRIFT
         case mode:
             raise AssertionError(mode)
 

@@ -29,7 +29,7 @@ PX4_CHECK_S = 0.1
 SHORTEST_GUIDED_S = 0.1
 
 
-class SilenceEffect(StrEnum):
+class SetpointLossEffect(StrEnum):
     """What happens to a flying vehicle without setpoints."""
 
     RETURN = "return"
@@ -45,18 +45,18 @@ class SilenceEffect(StrEnum):
 
 _DANGEROUS = frozenset(
     {
-        SilenceEffect.SINK,
-        SilenceEffect.DRIFT,
-        SilenceEffect.FALL,
-        SilenceEffect.FLY_ON,
-        SilenceEffect.UNKNOWN,
+        SetpointLossEffect.SINK,
+        SetpointLossEffect.DRIFT,
+        SetpointLossEffect.FALL,
+        SetpointLossEffect.FLY_ON,
+        SetpointLossEffect.UNKNOWN,
     }
 )
 
 
 @dataclass(frozen=True, slots=True)
-class SilenceOutcome:
-    """The result of `silence_outcome`.
+class SetpointLossOutcome:
+    """The result of `setpoint_loss_outcome`.
 
     Attributes:
         effect: what happens. mode: the mode then; UNKNOWN where none is entered or it is not known.
@@ -64,7 +64,7 @@ class SilenceOutcome:
         text: one sentence. warning: it endangers the vehicle, takes longer than `LONG_S`, or is not known.
     """
 
-    effect: SilenceEffect
+    effect: SetpointLossEffect
     mode: FlightMode
     after_s: float | None
     text: str
@@ -77,27 +77,27 @@ class SilenceOutcome:
 
 # COM_OBL_RC_ACT, apart from the modes flown by sticks
 _PX4_ACTIONS = {
-    3: (SilenceEffect.RETURN, FlightMode.RETURN),
-    4: (SilenceEffect.LAND, FlightMode.LAND),
-    5: (SilenceEffect.HOLD, FlightMode.HOLD),
-    6: (SilenceEffect.FALL, FlightMode.UNKNOWN),
-    7: (SilenceEffect.FALL, FlightMode.UNKNOWN),
+    3: (SetpointLossEffect.RETURN, FlightMode.RETURN),
+    4: (SetpointLossEffect.LAND, FlightMode.LAND),
+    5: (SetpointLossEffect.HOLD, FlightMode.HOLD),
+    6: (SetpointLossEffect.FALL, FlightMode.UNKNOWN),
+    7: (SetpointLossEffect.FALL, FlightMode.UNKNOWN),
 }
 _STICK_MODES = {1: FlightMode.ALTITUDE, 2: FlightMode.STABILIZED}  # of COM_OBL_RC_ACT; any other: POSITION
 # NAV_RCL_ACT; any other is no action: the vehicle stays in OFFBOARD
 _STICKS_LOST_ACTIONS = {
-    1: (SilenceEffect.HOLD, FlightMode.HOLD),
-    2: (SilenceEffect.RETURN, FlightMode.RETURN),
-    3: (SilenceEffect.LAND, FlightMode.LAND),
-    5: (SilenceEffect.FALL, FlightMode.UNKNOWN),
-    6: (SilenceEffect.FALL, FlightMode.UNKNOWN),
+    1: (SetpointLossEffect.HOLD, FlightMode.HOLD),
+    2: (SetpointLossEffect.RETURN, FlightMode.RETURN),
+    3: (SetpointLossEffect.LAND, FlightMode.LAND),
+    5: (SetpointLossEffect.FALL, FlightMode.UNKNOWN),
+    6: (SetpointLossEffect.FALL, FlightMode.UNKNOWN),
 }
 _GROUND_STATION_ACTIONS = {1: "RTL", 2: "RTL", 3: "SmartRTL", 4: "SmartRTL", 5: "LAND", 6: "RTL", 7: "BRAKE"}
 _OLDEST_PX4, _NEWEST_PX4 = (1, 14), (1, 18)
 _OLDEST_ARDUPILOT = (4, 1)
 
 
-def silence_outcome(read: AutopilotParameters, *, sticks_present: bool) -> SilenceOutcome:
+def setpoint_loss_outcome(read: AutopilotParameters, *, sticks_present: bool) -> SetpointLossOutcome:
     """Return what the autopilot does in flight when our setpoints stop.
 
     Args:
@@ -110,7 +110,7 @@ def silence_outcome(read: AutopilotParameters, *, sticks_present: bool) -> Silen
     return _unknown("the autopilot's version and parameters are not read yet")
 
 
-def _px4(read: AutopilotParameters, sticks_present: bool) -> SilenceOutcome:
+def _px4(read: AutopilotParameters, sticks_present: bool) -> SetpointLossOutcome:
     loss_s, act = read.get("COM_OF_LOSS_T"), read.get("COM_OBL_RC_ACT")
     if loss_s is None or act is None:
         name = "COM_OF_LOSS_T" if loss_s is None else "COM_OBL_RC_ACT"
@@ -124,19 +124,19 @@ def _px4(read: AutopilotParameters, sticks_present: bool) -> SilenceOutcome:
         return _outcome(read, *_PX4_ACTIONS[act], after_s, because)
     mode = _STICK_MODES.get(act, FlightMode.POSITION)
     if sticks_present:
-        return _outcome(read, SilenceEffect.PILOT, mode, after_s, because)
+        return _outcome(read, SetpointLossEffect.PILOT, mode, after_s, because)
     because += ", no sticks"
     if (replaced := _replaces_stick_modes(read.version)) is None:
         return _unknown(
             f"{because}: releases before 1.17 sink to the ground, later ones perform NAV_RCL_ACT", read
         )
     if not replaced:
-        effect = SilenceEffect.DRIFT if mode is FlightMode.STABILIZED else SilenceEffect.SINK
+        effect = SetpointLossEffect.DRIFT if mode is FlightMode.STABILIZED else SetpointLossEffect.SINK
         return _outcome(read, effect, mode, after_s, because)
     lost = read.get("NAV_RCL_ACT")
     if lost is None:
         return _unknown("NAV_RCL_ACT could not be read", read)
-    stays = (SilenceEffect.FLY_ON, FlightMode.OFFBOARD)
+    stays = (SetpointLossEffect.FLY_ON, FlightMode.OFFBOARD)
     effect, mode = _STICKS_LOST_ACTIONS.get(int(lost), stays)
     return _outcome(read, effect, mode, after_s, f"{because}: NAV_RCL_ACT {lost:g}")
 
@@ -151,7 +151,7 @@ def _replaces_stick_modes(version: FirmwareVersion | None) -> bool | None:
     return _release(version) >= (1, 17)
 
 
-def _ardupilot(read: AutopilotParameters) -> SilenceOutcome:
+def _ardupilot(read: AutopilotParameters) -> SetpointLossOutcome:
     if read.version is None or _release(read.version) < _OLDEST_ARDUPILOT:
         return _unknown("this version was not examined (4.1 and newer were)", read)
     guided_s = read.get("GUID_TIMEOUT")
@@ -164,7 +164,7 @@ def _ardupilot(read: AutopilotParameters) -> SilenceOutcome:
     )
     if after_s > LONG_S:
         text += "; set GUID_TIMEOUT to 1"
-    return SilenceOutcome(SilenceEffect.HOLD, FlightMode.OFFBOARD, after_s, text)
+    return SetpointLossOutcome(SetpointLossEffect.HOLD, FlightMode.OFFBOARD, after_s, text)
 
 
 def _without_heartbeats(read: AutopilotParameters) -> str:
@@ -189,28 +189,30 @@ def _release(version: FirmwareVersion) -> tuple[int, int]:
 
 
 _WORDS = {
-    SilenceEffect.RETURN: "returns home",
-    SilenceEffect.LAND: "lands where it is",
-    SilenceEffect.HOLD: "holds its position",
-    SilenceEffect.PILOT: "changes to {mode} mode, flown by the sticks",
-    SilenceEffect.SINK: "changes to {mode} mode and sinks to the ground where it is",
-    SilenceEffect.DRIFT: "changes to {mode} mode and drifts with its last tilt and thrust",
-    SilenceEffect.FALL: "stops its motors and falls",
-    SilenceEffect.FLY_ON: "stays in OFFBOARD and flies the last setpoint on",
+    SetpointLossEffect.RETURN: "returns home",
+    SetpointLossEffect.LAND: "lands where it is",
+    SetpointLossEffect.HOLD: "holds its position",
+    SetpointLossEffect.PILOT: "changes to {mode} mode, flown by the sticks",
+    SetpointLossEffect.SINK: "changes to {mode} mode and sinks to the ground where it is",
+    SetpointLossEffect.DRIFT: "changes to {mode} mode and drifts with its last tilt and thrust",
+    SetpointLossEffect.FALL: "stops its motors and falls",
+    SetpointLossEffect.FLY_ON: "stays in OFFBOARD and flies the last setpoint on",
 }
 
 
 def _outcome(
-    read: AutopilotParameters, effect: SilenceEffect, mode: FlightMode, after_s: float, because: str
-) -> SilenceOutcome:
+    read: AutopilotParameters, effect: SetpointLossEffect, mode: FlightMode, after_s: float, because: str
+) -> SetpointLossOutcome:
     words = _WORDS[effect].format(mode=mode.value)
-    if effect is SilenceEffect.FLY_ON:
-        return SilenceOutcome(effect, mode, None, f"without setpoints {read.firmware} {words} ({because})")
+    if effect is SetpointLossEffect.FLY_ON:
+        return SetpointLossOutcome(
+            effect, mode, None, f"without setpoints {read.firmware} {words} ({because})"
+        )
     text = f"without setpoints {read.firmware} {words} after {after_s:.1f} s ({because})"
-    return SilenceOutcome(effect, mode, after_s, text)
+    return SetpointLossOutcome(effect, mode, after_s, text)
 
 
-def _unknown(why: str, read: AutopilotParameters | None = None) -> SilenceOutcome:
+def _unknown(why: str, read: AutopilotParameters | None = None) -> SetpointLossOutcome:
     who = "the autopilot" if read is None else read.firmware
     text = f"what {who} does without setpoints is not known: {why}"
-    return SilenceOutcome(SilenceEffect.UNKNOWN, FlightMode.UNKNOWN, None, text)
+    return SetpointLossOutcome(SetpointLossEffect.UNKNOWN, FlightMode.UNKNOWN, None, text)

@@ -9,7 +9,7 @@ import pytest
 
 from companion.vehicle.ardupilot_profile import mode_of_custom_mode as copter_mode
 from companion.vehicle.px4_modes import mode_of_custom_mode
-from companion.vehicle.silence import SilenceEffect
+from companion.vehicle.setpoint_loss import SetpointLossEffect
 from tests.sitl.sitl_harness import PX4, Flight, set_for_test
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
@@ -62,7 +62,7 @@ def test_silence_does_what_the_service_says(
         flight.service.signal(signal.SIGCONT)
     flight.note(f"silence, COM_OBL_RC_ACT {action}, {said['effect']}", left_offboard_s=left_s, fell_m=fell_m)
     if link.autopilot != PX4:
-        assert said["effect"] == SilenceEffect.HOLD
+        assert said["effect"] == SetpointLossEffect.HOLD
         assert copter_mode(shown).value == said["mode"]
         assert abs(fell_m) < HELD_M
         return
@@ -70,11 +70,11 @@ def test_silence_does_what_the_service_says(
     assert left_s is not None
     late_s = 0.0 if link.version >= (1, 15) else 1.0  # without CURRENT_MODE, HEARTBEAT shows it once a second
     assert -0.4 < left_s - said["after_s"] < 0.4 + late_s
-    effect = SilenceEffect(said["effect"])
-    assert said["warning"] is (effect is SilenceEffect.SINK)
-    if effect in (SilenceEffect.SINK, SilenceEffect.LAND):
+    effect = SetpointLossEffect(said["effect"])
+    assert said["warning"] is (effect is SetpointLossEffect.SINK)
+    if effect in (SetpointLossEffect.SINK, SetpointLossEffect.LAND):
         assert fell_m > SUNK_M
-    elif effect is SilenceEffect.HOLD:
+    elif effect is SetpointLossEffect.HOLD:
         assert abs(fell_m) < HELD_M
 
 
