@@ -512,13 +512,13 @@ class AutopilotDriver(ABC):
         """Process the reply to `_synchronise`; the autopilot's own requests have `tc1` = 0."""
         now_ns = time.monotonic_ns()
         boot_ns, sent_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
-        # Older autopilots leave the target 0; our own stamp identifies the reply.
-        for_us = (system, component) in ((0, 0), self.own_address)
-        if boot_ns > 0 and for_us and sent_ns in self._timesyncs_ns:
+        # Our own stamp identifies the reply: PX4 v1.16.2 does not set its target, which is then any number, and
+        # older autopilots leave it 0.
+        if boot_ns > 0 and sent_ns in self._timesyncs_ns:
             self._telemetry.answered_ns = max(self._telemetry.answered_ns, sent_ns)
         elif boot_ns > 0 and (system, component) == self.own_address:
             self._on_foreign_timesync(now_ns)
-        if not (boot_ns > 0 and sent_ns == self._timesync_sent_ns and for_us):
+        if not (boot_ns > 0 and sent_ns == self._timesync_sent_ns):
             return
         self._telemetry.watch_clock("TIMESYNC", boot_ns // 1_000_000, now_ns)
         if self._telemetry.clock.answer(sent_ns, boot_ns, now_ns):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -274,6 +275,19 @@ def test_answers_to_others_timesync_show_a_shared_address(to: tuple[int, int], s
         (frame,) = frames_of(timesync(7 + number, to))
         one.driver._received(frame.raw, AUTOPILOT)
     assert (one.driver.state.address_shared_ns > 0) is shared
+
+
+@pytest.mark.parametrize("to", [(0, 0), (1, 191), (72, 115)])  # PX4 v1.16.2 sends any numbers
+def test_answer_with_our_stamp_is_ours_whoever_it_names(to: tuple[int, int]) -> None:
+    one = scripted()
+    stamp_ns = time.monotonic_ns()
+    one.driver._timesync_sent_ns = stamp_ns
+    one.driver._timesyncs_ns.append(stamp_ns)
+    (frame,) = frames_of(timesync(stamp_ns, to))
+    one.driver._received(frame.raw, AUTOPILOT)
+    assert one.driver._telemetry.answered_ns == stamp_ns
+    assert one.driver.state.clock is not None
+    assert one.driver.state.address_shared_ns == 0
 
 
 def timesync(stamp_ns: int, to: tuple[int, int]) -> bytes:
