@@ -104,7 +104,7 @@ def test_a_flight_alone_names_no_other_commander(flight: Flight) -> None:
     link = flight.link
     named = flight.said("another service commands this vehicle")
     since_s = time.monotonic()
-    flight.take_off(1.5)  # PX4: by setpoints
+    flight.take_off(5.0)
     for command in (
         "hold duration=5",
         "goto forward=10 right=5 altitude=6 speed=4",
@@ -118,7 +118,8 @@ def test_a_flight_alone_names_no_other_commander(flight: Flight) -> None:
     flight.fly("hold")
     link.after(5.0)
     flight.fly("land", 90.0)
-    link.after(2.0)
+    flight.fly("takeoff 1.5")  # PX4: by setpoints
+    flight.fly("land", 90.0)
     assert not named(), flight.events
     flight.note("a flight alone", seconds=time.monotonic() - since_s)
 
