@@ -512,7 +512,7 @@ class AutopilotDriver(ABC):
         """Process the reply to `_synchronise`; the autopilot's own requests have `tc1` = 0."""
         now_ns = time.monotonic_ns()
         boot_ns, sent_ns, system, component = _TIMESYNC.unpack(frame.padded(_TIMESYNC.size))
-        # Our own stamp identifies the reply: PX4 v1.16.2 does not set its target, which is then any number, and
+        # Our own stamp identifies the reply: PX4 v1.16.2 does not set its target, which is then any number;
         # older autopilots leave it 0.
         if boot_ns > 0 and sent_ns in self._timesyncs_ns:
             self._telemetry.answered_ns = max(self._telemetry.answered_ns, sent_ns)
