@@ -1,4 +1,4 @@
-"""What the service's input tells guidance about changes of the mode."""
+"""Changes of the mode, as the service passes them to guidance."""
 
 from __future__ import annotations
 
