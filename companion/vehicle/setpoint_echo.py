@@ -20,7 +20,6 @@ import math
 from collections import deque
 
 from companion.vehicle.commander import ForeignSetpoint
-from companion.vehicle.setpoint import IGNORE_POSITION, IGNORE_VELOCITY
 from companion.vehicle.state import FlightMode, LandedState, VehicleState, with_fields
 from companion.vehicle.telemetry import Fields
 
@@ -37,9 +36,7 @@ FOREIGN, WINDOW_S = 3, 120.0
 TOLERANCE = 0.01
 # Slower than this a velocity is no reduced one, except of a climb.
 REDUCED_MPS = 0.5
-_POSITION_BITS, _VELOCITY_BITS = (1, 2, 4), (8, 16, 32)
-assert sum(_POSITION_BITS) == IGNORE_POSITION
-assert sum(_VELOCITY_BITS) == IGNORE_VELOCITY
+_POSITION_BITS, _VELOCITY_BITS = (1, 2, 4), (8, 16, 32)  # POSITION_TARGET_TYPEMASK
 
 Axis = tuple[str, float]  # unit (metres or m/s) and value
 Axes = tuple[Axis, Axis, Axis]  # north, east, down
