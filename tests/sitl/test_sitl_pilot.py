@@ -49,7 +49,7 @@ CAR_M, PAD_M, PAD_ID = 16.0, 1.5, 4
 SEEN_FRAMES, SEEING_S = 10, 60.0
 SIGHTED = (
     "seek boat",
-    "seek boat pattern=square radius=12",
+    "seek boat pattern=square radius=12 spacing=6",
     "approach car distance=4",
     "follow car distance=6",
     "orbit car radius=8 speed=2",
