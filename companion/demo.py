@@ -189,7 +189,7 @@ async def _until_finished(
         if lost.done() and not flying.done():
             flight.failure = str(lost.exception())
             say(flight.failure)
-            if not service.ready:
+            if not service.driver.link_count:
                 raise SimSessionError(flight.failure)
             await asyncio.wait({flying}, timeout=max(deadline_s - time.monotonic(), 0.0))
         if not flying.done():

@@ -72,7 +72,10 @@ def detect(
         str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")
     ] = None,
 ) -> None:
-    """Detect objects in the frames of a source. Prints a line per frame, and a summary on standard error."""
+    """Detect objects in the frames of a source. Prints a line per frame, and a summary on standard error.
+
+    A live picture in the browser: companion view SOURCE.
+    """
     with gc_paused():
         from companion.detect import detect_source, make_save_folder
         from companion.plugins import PluginError, load_plugins

@@ -24,9 +24,10 @@ _REMIND_S = 5.0
 
 
 def run(settings: Settings) -> None:
-    """Run the service. It starts with what is there: autopilot and camera are used as soon as they come.
+    """Run the service.
 
-    Ends as `companion.service.ending` says. Exit code 2: wrong settings; 75: another start may succeed.
+    It starts with what is there: autopilot and camera are used as soon as they come. Exit code 2: wrong
+    settings; 75: another start may succeed.
     """
     run_service(settings)
 

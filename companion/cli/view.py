@@ -26,9 +26,10 @@ def view(
         str, typer.Argument(help="File, folder, /dev/video0, csi://0, FIFO, - (standard input) or URL.")
     ],
 ) -> None:
-    """Show a source in the browser, live, with what is detected in it. No vehicle.
+    """Show a source live in the browser, with its detections.
 
-    The rest is as `companion run`: topics on zenoh, recording, several cameras. A file is repeated.
+    Without a vehicle; the rest is as companion run: topics on zenoh, recording, several cameras. A file is
+    repeated.
     """
     from companion.settings.perception import NO_SOURCE
     from companion.settings.vehicle import NO_VEHICLE

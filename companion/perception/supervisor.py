@@ -1,7 +1,7 @@
 """The perception worker's supervisor: starts it, reads its messages, restarts it when it is dead or stuck.
 
 Nothing here waits for the worker: its messages are processed as they arrive. A worker that is silent for too
-long is killed. After `MAX_RESTARTS` restarts in `RESTART_WINDOW_S` one is tried every `SLOW_RETRY_S`.
+long is killed. It is started again as `companion.restarts` says, without end.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from companion.perception.messages import (
 from companion.perception.process import PerceptionProcess, RateLimiter, Watchdog
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
+from companion.restarts import Restart, Restarts
 from companion.settings import Settings
 from companion.tasks import spawn
 from companion.vehicle.state import Vector3
@@ -50,15 +51,11 @@ logger = logging.getLogger(__name__)
 
 __all__ = ["PerceptionStartError", "PerceptionState", "PerceptionStatus", "PerceptionSupervisor"]
 
-MAX_RESTARTS = 5
-RESTART_WINDOW_S = 60.0
-SLOW_RETRY_S = 30.0
-# The same reason again is reported with every so many slow tries.
+# The same reason again is reported with every so many tries that are not soon.
 _REPORTED_TRIES = 10
 STOP_S, TERMINATE_S = 5.0, 1.0
 # A selection is answered with the next processed frame.
 SELECT_TIMEOUT_S = 3.0
-_BACK_OFF_S = (0.2, 1.0, 2.0, 4.0, 8.0)
 _TICK_S = 0.25
 _RATE_WINDOW_S = 2.0
 
@@ -139,10 +136,8 @@ class PerceptionSupervisor:
         self._hud = Hud((), None)
         self._problem = ""
         self._restarts = 0
-        self._deaths_s: deque[float] = deque()
-        self._tries = 0
-        self._reported: tuple[str, int] | None = None
-        self._slow = False
+        self._pauses = Restarts()
+        self._reported = ("", 0)
         self._ready_s: float | None = None
         self._next_try_ns: int | None = None
         self._lost_s: float | None = None
@@ -359,11 +354,11 @@ class PerceptionSupervisor:
             if end.wrong_settings and not started.done():
                 self._state = PerceptionState.FAILED
                 return
-            pause_s = self._after_death(end)
-            self._state = PerceptionState.FAILED if self._slow else PerceptionState.RESTARTING
-            self._next_try_ns = time.monotonic_ns() + round(pause_s * 1e9)
+            restart = self._after_death(end)
+            self._state = PerceptionState.FAILED if restart.later else PerceptionState.RESTARTING
+            self._next_try_ns = time.monotonic_ns() + round(restart.pause_s * 1e9)
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(pause_s):
+                async with asyncio.timeout(restart.pause_s):
                     await self._stop_asked.wait()
                 return
             self._next_try_ns = None
@@ -380,32 +375,20 @@ class PerceptionSupervisor:
             text += f"; the video {self._worker_settings().recording.video} may be incomplete"
         self._on_event("warning", f"perception {text}")
 
-    def _after_death(self, end: _End) -> float:
-        """Report the loss; returns the seconds until the next start."""
+    def _after_death(self, end: _End) -> Restart:
+        """Report the loss; returns the next start."""
         now_s = time.monotonic()
         self._lost_s = self._lost_s or now_s
-        self._tries += 1
-        if self._slow and self._ready_s is not None and now_s - self._ready_s > SLOW_RETRY_S:
-            self._slow = False  # the last one has worked for a while
-            self._deaths_s.clear()
+        restart = self._pauses.after(0.0 if self._ready_s is None else now_s - self._ready_s)
         self._ready_s = None
-        self._deaths_s.append(now_s)
-        while now_s - self._deaths_s[0] > RESTART_WINDOW_S:
-            self._deaths_s.popleft()
-        deaths = len(self._deaths_s)
-        if deaths > MAX_RESTARTS:
-            self._slow = True
-        if not self._slow:
-            what = "lost" if self._ready is not None else "not started"
-            text = f"perception {what}: {end.text}; restarting ({deaths} of {MAX_RESTARTS})"
+        text = f"perception {'not started' if self._ready is None else 'lost'}: {end.text}; {restart}"
+        reason, count = self._reported
+        if not restart.later:
             self._on_event("warning", text)
-            return _BACK_OFF_S[min(deaths, len(_BACK_OFF_S)) - 1]
-        reason, reported = self._reported or ("", 0)
-        if end.text != reason or self._tries - reported >= _REPORTED_TRIES:
-            self._reported = (end.text, self._tries)
-            text = f"perception failed {self._tries} times, last: {end.text}"
-            self._on_event("error", f"{text}; it is tried every {SLOW_RETRY_S:g} s")
-        return SLOW_RETRY_S
+        elif end.text != reason or not 0 <= restart.count - count < _REPORTED_TRIES:
+            self._reported = (end.text, restart.count)
+            self._on_event("error", text)
+        return restart
 
     async def _run_one(self, started: asyncio.Future[None]) -> _End:
         """Start one worker and supervise it until its end."""

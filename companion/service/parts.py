@@ -100,6 +100,7 @@ class Parts:
         self._has_vehicle = settings.expected
         self._link = Part(AUTOPILOT, PartState.STARTING)
         self._since: dict[str, Part] = {}
+        self._been_up: set[str] = set()
 
     def now(self, now_ns: int) -> tuple[Part, ...]:
         """Return all parts, the autopilot first."""
@@ -111,6 +112,8 @@ class Parts:
             before = self._since.get(part.name)
             since_ns = before.since_ns if before is not None and before.state is part.state else now_ns
             parts[index] = self._since[part.name] = replace(part, since_ns=since_ns)
+            if part.up:
+                self._been_up.add(part.name)
         return tuple(parts)
 
     def bodies(self, now_ns: int) -> list[PartBody]:
@@ -186,7 +189,7 @@ class Parts:
             unsubscribe()
 
     async def complete(self, within_s: float | None = None, *, autopilot: bool = True) -> None:
-        """Wait until autopilot and cameras are up.
+        """Wait until autopilot and cameras have been up.
 
         Args:
             autopilot: False: only the cameras.
@@ -199,7 +202,9 @@ class Parts:
         deadline_s = None if within_s is None else time.monotonic() + within_s
         others = (ZENOH,) if autopilot else (ZENOH, AUTOPILOT)
         while waiting := [
-            part for part in self.now(time.monotonic_ns()) if not part.up and part.name not in others
+            part
+            for part in self.now(time.monotonic_ns())
+            if part.name not in self._been_up and part.name not in others
         ]:
             for part in waiting if deadline_s is not None else ():
                 assert deadline_s is not None

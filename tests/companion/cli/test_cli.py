@@ -21,8 +21,9 @@ from typer.testing import CliRunner
 from companion.bus.topics import NO_OBJECTS, TOPICS
 from companion.cli import flags
 from companion.cli.commands import app
-from companion.cli.flags import warn_rendered_only
+from companion.cli.flags import EXIT_PASSING, warn_rendered_only
 from companion.guidance.command import COMMANDS
+from companion.settings import Settings
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
 from vision.object_detector import YOLO
@@ -190,15 +191,63 @@ def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     assert "0 to 1" in line
 
 
-def test_vehicle_without_answer_is_one_line(tmp_path: Path) -> None:
-    port = free_port()
-    done = companion(
-        "run", "--source", "none", "--vehicle-url", f"udpin://127.0.0.1:{port}",
-        "--vehicle-connect-timeout-s", "1",
-        "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
-    )  # fmt: skip
-    line = one_line_of_bad_input(done)
-    assert f"udpin://127.0.0.1:{port}" in line
+@pytest.mark.parametrize("taken", ["--zenoh-listen", "--metrics-listen"])
+def test_taken_port_ends_run_with_a_code_for_another_try(taken: str, tmp_path: Path) -> None:
+    if taken == "--metrics-listen":
+        pytest.importorskip("prometheus_client", reason="prometheus_client is an optional extra")
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        listen = {"--zenoh-listen": f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"}
+        listen |= {taken: f"tcp/{address}" if taken == "--zenoh-listen" else address}
+        words = [word for pair in listen.items() for word in pair]
+        done = companion("run", "--source", "none", "--vehicle-url", "none", *words, cwd=tmp_path)
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("companion:")]
+    assert done.returncode == EXIT_PASSING, done.stderr
+    assert address in line
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ("--vehicle-url", "serial:///dev/ttyS0:12345"),
+        ("--vehicle-signing-key-file", "no.key"),
+        ("--plugins-modules", "no_such_plugin"),
+        ("--zenoh-config-file", "no.json5"),
+    ],
+)
+def test_wrong_settings_end_run_with_one_line(wrong: tuple[str, str], tmp_path: Path) -> None:
+    done = companion("run", "--source", "none", *wrong, cwd=tmp_path)
+    assert wrong[1] in one_line_of_bad_input(done)
+
+
+def test_view_is_run_without_a_vehicle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown: list[Settings] = []
+    monkeypatch.setattr("companion.cli.view.run_service", lambda settings, _: shown.append(settings))
+    (tmp_path / "companion.toml").write_text("[vehicle]\nurl = 'udpin://0.0.0.0:14540'\n")
+    assert companion_here("view", "street.mp4", "--model", "yolo11n", cwd=tmp_path).returncode == 0
+    assert companion_here("view", "-", "--source-loop", "false", cwd=tmp_path).returncode == 0
+    assert [each.vehicle.expected for each in shown] == [False, False]
+    assert [(each.source.uri, each.source.loop) for each in shown] == [("street.mp4", True), ("-", False)]
+    assert shown[0].detector.model == "yolo11n"
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("a.mp4", "--source", "b.mp4"), "source.uri"),
+        (("a.mp4", "--vehicle-url", "tcp://127.0.0.1:5760"), "vehicle.url"),
+        (("a.mp4", "--dashboard-listen", ""), "dashboard.listen"),
+        (("none",), "view none"),
+    ],
+)
+def test_view_names_what_does_not_fit(words: tuple[str, ...], named: str, tmp_path: Path) -> None:
+    assert named in one_line_of_bad_input(companion_here("view", *words, cwd=tmp_path))
+
+
+def test_play_with_an_own_source_names_the_command(tmp_path: Path) -> None:
+    assert "companion view a.mp4" in one_line_of_bad_input(
+        companion_here("play", "--source", "a.mp4", cwd=tmp_path)
+    )
 
 
 def test_unopenable_source_ends_run_with_one_line(tmp_path: Path) -> None:
@@ -326,7 +375,7 @@ def test_help_lists_commands_in_order_of_use() -> None:
     shown = CliRunner().invoke(app, ["--help"]).stdout
     listed = shown.partition("Commands:")[2].split("\n")
     commands = [line.split()[0] for line in listed if line.startswith("  ") and line.strip()]
-    assert commands[:6] == ["play", "run", "demo", "detect", "send", "echo"]
+    assert commands[:6] == ["view", "play", "run", "demo", "detect", "send"]
     assert "--install-completion" in shown
 
 

@@ -10,12 +10,8 @@ from collections.abc import Callable
 import pytest
 
 from companion.perception.messages import StartFailed
-from companion.perception.supervisor import (
-    SLOW_RETRY_S,
-    PerceptionStartError,
-    PerceptionState,
-    PerceptionSupervisor,
-)
+from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
+from companion.restarts import LATER_S
 from companion.settings.reading import load_settings
 from tests.companion.perception.scripted_worker import LOADING_S, ScriptedWorker
 from tests.companion.simulated_clock import SimulatedClock, run_simulated
@@ -61,8 +57,8 @@ def test_worker_killed_20_times_in_60_s_runs_again(
         assert "killed by SIGKILL" in supervisor.problem
         worker.started[-1].kill()  # at once again: still slow
         await until(lambda: supervisor.state is PerceptionState.FAILED, 1.0)
-        await until(lambda: supervisor.state is PerceptionState.RUNNING, SLOW_RETRY_S + LOADING_S + 1.0)
-        await asyncio.sleep(2 * SLOW_RETRY_S)
+        await until(lambda: supervisor.state is PerceptionState.RUNNING, LATER_S + LOADING_S + 1.0)
+        await asyncio.sleep(2 * LATER_S)
         worker.started[-1].kill()  # after a while: quickly again
         await until(lambda: supervisor.state is PerceptionState.RESTARTING, 1.0)
         await until(lambda: supervisor.state is PerceptionState.RUNNING, LOADING_S + 1.0)
@@ -84,11 +80,11 @@ def test_missing_source_is_waited_for_in_few_lines(
         assert len(supervisor.events) < 12
         levels = [level for level, _ in supervisor.events]
         assert levels == sorted(levels, reverse=True)  # warnings, then errors
-        assert "failed 16 times" in supervisor.events[-1][1]
+        assert "16 failures so far" in supervisor.events[-1][1]
         next_ns = supervisor.next_try_ns
-        assert next_ns is None or 0 <= next_ns - time.monotonic_ns() <= SLOW_RETRY_S * 1e9
+        assert next_ns is None or 0 <= next_ns - time.monotonic_ns() <= LATER_S * 1e9
         worker.fails = None
-        await asyncio.wait_for(starting, SLOW_RETRY_S + 2 * LOADING_S)
+        await asyncio.wait_for(starting, LATER_S + 2 * LOADING_S)
         assert supervisor.state is PerceptionState.RUNNING
         assert supervisor.next_try_ns is None
         await supervisor.stop()
@@ -113,7 +109,7 @@ def test_wrong_settings_end_the_first_start_only(
         await asyncio.sleep(120.0)
         assert supervisor.state is PerceptionState.FAILED
         worker.fails = None
-        await until(lambda: supervisor.state is PerceptionState.RUNNING, SLOW_RETRY_S + LOADING_S + 1.0)
+        await until(lambda: supervisor.state is PerceptionState.RUNNING, LATER_S + LOADING_S + 1.0)
         await supervisor.stop()
 
     run_simulated(monkeypatch, SimulatedClock(), work())
