@@ -56,8 +56,7 @@ class GuidanceLoop:
     Args:
         rate_hz: of guidance.
         on_event: called with (level, text). on_step: called after every step with its time.
-        others: other services that command the vehicle.
-        no_vehicle: returns why no command can be flown, or None.
+        others: that command the vehicle. no_vehicle: returns why no command can be flown, or None.
         record: called with time, context, input and output of every step.
     """
 
