@@ -52,4 +52,4 @@ def test_wheel_holds_the_packages_and_their_data(tmp_path: Path) -> None:
 def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
     with tarfile.open(build(tmp_path, "build_sdist")) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "README.md", "LICENSE", "systemd/companion.service"} <= names
+    assert {"pyproject.toml", "README.md", "LICENSE", "NOTICE", "systemd/companion.service"} <= names
