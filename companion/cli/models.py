@@ -116,7 +116,12 @@ def pull(
 def export(
     file: Annotated[str, typer.Argument(help="Checkpoint, `default`, or name in the models folder.")],
     to: Annotated[str, typer.Option(help="Format: onnx, openvino, tensorrt or torchscript.")],
-    output: Annotated[Path | None, typer.Option(help="Output file. Default: beside the checkpoint.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            help="Output file. Default: beside the checkpoint; of the bundled model in the models folder."
+        ),
+    ] = None,
     image_size: Annotated[
         int, typer.Option(min=32, help="Image size for tuning and checking, pixels.")
     ] = 640,
@@ -129,8 +134,10 @@ def export(
     ] = None,
 ) -> None:
     """Export a model for another runtime. The file is compared with the model before it is kept."""
+    from vision.model_files import models_folder
     from vision.runtimes.base import RuntimeUnusableError
     from vision.runtimes.export import export
+    from vision.weights import DEFAULT_WEIGHTS
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
     from vision.yolo.published import model_family_of
 
@@ -146,6 +153,7 @@ def export(
             to,  # type: ignore[arg-type]  # checked there
             output,
             image_size,
+            folder=models_folder() if path == DEFAULT_WEIGHTS else None,
             model_family=model_family,
             calibrate=calibrate,
         )
@@ -155,7 +163,7 @@ def export(
 @models.command()
 def verify(
     source: Annotated[str, typer.Argument(help="Checkpoint.")],
-    exported: Annotated[Path, typer.Argument(help="File from `companion models export`.")],
+    exported: Annotated[str, typer.Argument(help="File from `companion models export`.")],
     images: Annotated[
         Path | None, typer.Option(help="Folder of images to compare on. Default: rendered scenes.")
     ] = None,
@@ -170,12 +178,13 @@ def verify(
 ) -> None:
     """Compare an exported model with its source. Exit code 1 if they differ."""
     from companion.models.verify import parity_lines, sample_images, verify
+    from vision.model_files import find_model
     from vision.runtimes.base import RuntimeUnusableError
     from vision.yolo.safe_pickle import CheckpointError
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         samples = sample_images(images, count)
-        parity = verify(_checkpoint(source), exported, samples, image_size, threads=threads)
+        parity = verify(_checkpoint(source), find_model(exported), samples, image_size, threads=threads)
     holds = parity.holds(map_tolerance, box_tolerance)
     if as_json:
         typer.echo(json.dumps({**parity.plain(), "holds": holds}))

@@ -51,6 +51,7 @@ def export(
     output: Path | None = None,
     image_size: int = 640,
     *,
+    folder: Path | None = None,
     model_family: str = "",
     calibrate: Path | None = None,
 ) -> Path:
@@ -60,8 +61,9 @@ def export(
     level (stride S) `sides_S` and `classes_S`, see `LevelOutput`. It contains its `ExportedFacts`.
 
     Args:
-        output: file to write; None: beside the checkpoint, with the kind's suffix (`SUFFIXES`).
+        output: file to write; None: the checkpoint's name with the kind's suffix (`SUFFIXES`), in `folder`.
         image_size: size for tuning and verification; for a TensorRT plan the largest side.
+        folder: None: the checkpoint's.
         model_family: of the network, stored in the facts.
         calibrate: a folder of images; the file is then quantised to int8 (`onnx` and `openvino`).
 
@@ -92,7 +94,9 @@ def export(
     )
     if image_size < 2 * max(facts.strides) or image_size % max(facts.strides):
         raise RuntimeUnusableError(f"image_size must be a multiple of {max(facts.strides)}, got {image_size}")
-    path = model_path.with_suffix(SUFFIXES[to]) if output is None else output
+    path = output
+    if path is None:
+        path = (model_path.parent if folder is None else folder) / f"{model_path.stem}{SUFFIXES[to]}"
     if path.suffix != SUFFIXES[to]:
         raise RuntimeUnusableError(f"{path}: a file for {to} must end in {SUFFIXES[to]}")
     calibration = calibration_images(calibrate, image_size, max(facts.strides)) if calibrate else ()

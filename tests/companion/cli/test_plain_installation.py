@@ -122,7 +122,14 @@ def commands(command: Any, name: str = "") -> Iterator[str]:
 
 
 def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tuple[str, ...], str]]) -> Any:
-    """Run the commands in a folder with an image, a checkpoint, a recording and a labelled set."""
+    """Run the commands in a folder with an image, a checkpoint, a recording and a labelled set.
+
+    What is run is a copy of the packages: nothing may be written into it.
+    """
+    packages = folder.parent / "packages"
+    for name in ("companion", "mavlink_sim", "vision"):
+        shutil.copytree(ROOT / name, packages / name, ignore=shutil.ignore_patterns("__pycache__"))
+    installed = files(packages)
     shutil.copy(ROOT / "docs/images/demo.png", folder)
     (folder / "labelled").mkdir()
     shutil.copy(ROOT / "docs/images/demo.png", folder / "labelled")
@@ -130,11 +137,11 @@ def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tupl
     for name in ("old.pt", "flight.mcap"):
         (folder / name).touch()
     given = json.dumps([[*command.split(), *arguments] for command, arguments, _ in walk])
-    path = os.pathsep.join((environment["PYTHONPATH"], str(ROOT)))
+    path = os.pathsep.join((environment["PYTHONPATH"], str(packages)))
     done = subprocess.run(
         [sys.executable, "-c", CHILD, given],
         cwd=folder,
-        env=environment | {"PYTHONPATH": path},
+        env=environment | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
@@ -142,7 +149,13 @@ def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tupl
     )
     results = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(results) == len(walk), done.stderr
+    assert files(packages) == installed
     return results
+
+
+def files(folder: Path) -> dict[Path, int]:
+    """The files of a folder, with the time of their last change."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 def test_walk_has_every_command() -> None:

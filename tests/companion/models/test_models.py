@@ -106,6 +106,25 @@ def test_info_of_the_bundled_model_is_that_of_its_export() -> None:
     assert facts["sha256"] == weights_sha256(DEFAULT_EXPORT)
 
 
+@pytest.mark.timeout(300)
+def test_export_of_the_bundled_model_goes_to_the_models_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path / "models"))
+    before = package_files()
+    run("export", "default", "--to", "onnx", "--image-size", "64")
+    assert [path.name for path in (tmp_path / "models").iterdir()] == ["default.onnx"]
+    assert package_files() == before
+    assert find_model("default.onnx").parent == tmp_path / "models"
+
+
+def package_files() -> set[tuple[str, int]]:
+    """The files beside the bundled weights, with the time of the last change."""
+    return {
+        (path.name, path.stat().st_mtime_ns) for path in DEFAULT_EXPORT.parent.iterdir() if path.is_file()
+    }
+
+
 def test_unknown_runtime_is_an_error() -> None:
     result = CliRunner().invoke(app, ["models", "info", "default", "--runtime", "abacus"])
     assert result.exit_code == 2
