@@ -12,6 +12,7 @@ import tomllib
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
+from typing import Any
 
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
@@ -101,11 +102,11 @@ def licences(requirements: Iterable[str]) -> dict[str, str]:
 
 
 def _licence(name: str) -> str:
-    metadata = distribution(name).metadata
+    metadata: Any = distribution(name).metadata  # its protocol in the standard library lacks `get`
     prefix = "License :: OSI Approved :: "
     lines = metadata.get_all("Classifier") or []
     classified = [line.removeprefix(prefix) for line in lines if line.startswith(prefix)]
-    text = metadata.get("License") or ""
+    text = str(metadata.get("License") or "")
     if stated := metadata.get("License-Expression"):
         return str(stated)
     if len(classified) > 1:

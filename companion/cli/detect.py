@@ -74,7 +74,7 @@ def detect(
 ) -> None:
     """Detect objects in the frames of a source. Prints a line per frame, and a summary on standard error.
 
-    A live picture in the browser: companion view SOURCE.
+    A live image in the browser: companion view SOURCE.
     """
     with gc_paused():
         from companion.detect import detect_source, make_save_folder

@@ -79,7 +79,6 @@ class GuidanceLoop:
         self._period_s = 1 / rate_hz
         self._on_event, self._on_step, self._record = on_event, on_step, record
         self._wake = asyncio.Event()
-        self._seen = False
         self._requests = RequestRunner(driver, self._wake.set)
         self._commands = CommandHandler(
             lambda identifier, text: inputs.read_command(
@@ -95,7 +94,7 @@ class GuidanceLoop:
                 )
             ),
         )
-        self._running = self._ending = False
+        self._running = self._ending = self._seen = False
         self._slow: tuple[str, int] = ("", 0)
 
     async def execute(self, text: str) -> dict[str, Any]:

@@ -179,7 +179,7 @@ def test_every_command_works_or_names_its_extra(tmp_path: Path) -> None:
 
 
 def test_only_listed_modules_need_an_extra(tmp_path: Path) -> None:
-    """Imported alone each: what flies imports none of them."""
+    """Imported alone each: the service imports none of them."""
     code = """
 import importlib, json, pkgutil
 missing = {}

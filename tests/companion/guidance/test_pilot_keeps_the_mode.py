@@ -73,7 +73,7 @@ def shut_down(flight: LockstepFlight) -> None:
     mode = mode_at_shutdown(flight.state, flight.guidance.phase, flight.streamer.state)
     flight.step(ending=True)
     if mode is not None:
-        flight.driver.start(Request(SHUTDOWN, SetMode(mode)))
+        flight.driver.start(Request(SHUTDOWN, SetMode(mode), flight.now_ns + 8_000_000_000))
 
 
 def by(text: str) -> Callable[[LockstepFlight], None]:

@@ -1,4 +1,4 @@
-"""A worker is tried for ever, on a simulated clock: quickly at first, then every 30 s."""
+"""A worker is tried without end, on a simulated clock: quickly at first, then every 30 s."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import asyncio
 import json
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,8 +15,7 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.bus.vehicle_messages import pose_message
 from companion.clock import StandstillWatch
 from companion.guidance.core import Guidance
-from companion.guidance.formation.neighbours import global_problem
-from companion.guidance.formation.pose import Pose
+from companion.guidance.formation.pose import Pose, global_problem
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.mode_control import Phase
 from companion.perception.cameras import PerceptionCamera
@@ -58,7 +57,7 @@ class World:
         self.guidance = Guidance()
         self.got: list[GuidanceInput] = []
         self.outputs: list[GuidanceOutput] = []
-        self.driver: Any = Driver(self)
+        self.driver = cast(Any, Driver(self))
         clock = SimpleNamespace(
             monotonic_ns=lambda: self.now_ns, thread_time_ns=lambda: 0, monotonic=lambda: self.now_ns / 1e9
         )
