@@ -114,7 +114,7 @@ def _licence(name: str) -> str:
     # Some metadata has the whole text of the licence.
     for stated in (text if 0 < len(text) < 40 else "", *classified):
         if stated:
-            return _SPDX.get(stated, stated)
+            return str(_SPDX.get(stated, stated))
     if name in _UNSTATED:
         return _UNSTATED[name]
     raise LookupError(f"{name} states no licence; read it, and add it to _UNSTATED")
