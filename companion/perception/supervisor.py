@@ -378,7 +378,8 @@ class PerceptionSupervisor:
     def _after_death(self, end: _End) -> Restart:
         """Report the loss; returns the next start."""
         now_s = time.monotonic()
-        self._lost_s = self._lost_s or now_s
+        if self._ready is not None:
+            self._lost_s = self._lost_s or now_s
         restart = self._pauses.after(0.0 if self._ready_s is None else now_s - self._ready_s)
         self._ready_s = None
         text = f"perception {'not started' if self._ready is None else 'lost'}: {end.text}; {restart}"

@@ -87,6 +87,7 @@ def test_missing_source_is_waited_for_in_few_lines(
         await asyncio.wait_for(starting, LATER_S + 2 * LOADING_S)
         assert supervisor.state is PerceptionState.RUNNING
         assert supervisor.next_try_ns is None
+        assert supervisor.events[-1][1].startswith("perception running: scripted")
         await supervisor.stop()
 
     run_simulated(monkeypatch, SimulatedClock(), work())
