@@ -32,7 +32,7 @@ from vision.object_detector import (
 from vision.registry import shown
 from vision.runtimes.base import PRECISIONS, Device, Precision, installed
 from vision.runtimes.selection import RuntimeChoice, check_runtime, check_runtime_name, start_runtime
-from vision.runtimes.source import ModelSource, read_source
+from vision.runtimes.source import ModelSource, check_model_file, read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_EXPORT, DEFAULT_WEIGHTS
 from vision.yolo.checkpoint_pair import weights_sha256
@@ -281,10 +281,7 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
             a plug-in's kind gives no `ObjectDetector` with `class_names`.
     """
     if (opener := DETECTORS.get(kind)) is None:
-        raise ValueError(
-            f"detector.kind: unknown kind {kind!r}; known: {DETECTORS.known()}. Kinds of a plug-in "
-            "are known once its module is loaded (plugins.modules, --plugins-modules)"
-        )
+        raise _unknown_kind(kind)
     opened = opener(settings)
     if kind == YOLO:
         return opened
@@ -294,6 +291,27 @@ def open_detector(kind: str, settings: DetectorSettings) -> ObjectDetector:
     if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
         raise ValueError(f"detector.kind {kind!r}: class_names must be a tuple of str, got {shown(names)}")
     return _FilteredDetector(opened, kind, settings)
+
+
+def check_detector(kind: str, settings: DetectorSettings) -> None:
+    """Check what is known of a detector before it is loaded: its kind, and of `yolo` its file and runtime.
+
+    Raises:
+        ValueError: no such kind. CheckpointError, RuntimeMissingError, RuntimeUnusableError: ValueErrors too.
+    """
+    if DETECTORS.get(kind) is None:
+        raise _unknown_kind(kind)
+    if kind == YOLO:
+        check_runtime_name(settings.runtime)
+        path = model_path(settings.model, settings.runtime, settings.precision, settings.device)
+        check_model_file(path, settings.runtime)
+
+
+def _unknown_kind(kind: str) -> ValueError:
+    return ValueError(
+        f"detector.kind: unknown kind {kind!r}; known: {DETECTORS.known()}. Kinds of a plug-in "
+        "are known once its module is loaded (plugins.modules, --plugins-modules)"
+    )
 
 
 class _FilteredDetector(ObjectDetector):

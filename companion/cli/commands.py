@@ -129,10 +129,23 @@ def every_command(
 
 
 @settings_command(app)
-def config(settings: Settings) -> None:
+def config(
+    settings: Settings,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Print only what is wrong: also key files, model, sources, folders."),
+    ] = False,
+) -> None:
     """Print the effective settings. The output is a TOML file with a comment on every key."""
-    from companion.settings.reading import to_toml
+    from companion.settings.reading import ConfigurationError, to_toml
 
+    if check:
+        from companion.config_check import check_settings
+
+        with plain_errors(ConfigurationError):
+            for line in check_settings(settings):
+                typer.echo(f"companion: {line}", err=True)
+        return
     typer.echo(to_toml(settings), nl=False)
 
 

@@ -36,12 +36,14 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
     """Run the service, as `run`. `on_page` is called with the page's line that has its address."""
     with gc_paused():
         from companion.bus.config import BusError, EndpointTakenError
+        from companion.config_check import check_settings
         from companion.language.process import AskProcess
         from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import AddressTakenError, MetricsError
         from companion.perception.supervisor import PerceptionStartError
         from companion.plugins import PluginError
         from companion.service import Service
+        from companion.settings.reading import ConfigurationError
         from companion.vehicle.driver import LinkError
 
     # A stalled reader of standard error must not block the service. Before any handler uses the stream.
@@ -50,9 +52,12 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
         level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
     )
     with (
-        plain_errors(LinkError, PerceptionStartError, BusError, MetricsError, PluginError),
+        plain_errors(
+            *(ConfigurationError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
+        ),
         plain_errors(EndpointTakenError, AddressTakenError, code=EXIT_PASSING),
     ):
+        check_settings(settings)  # what is missing is reported by its part
         service = Service(
             settings,
             console=True,

@@ -19,6 +19,8 @@ from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import NamedTuple
 
+from companion.key_files import KeyFileError, check_private
+
 HEADER = "x-companion-dashboard"
 """A POST needs it, with any value: a page of another origin cannot send it without a CORS permission."""
 COOKIE = "companion_dashboard"
@@ -61,9 +63,10 @@ def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
             content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
     except OSError as error:
         raise DashboardError(f"{name} {path}: cannot be read: {error.strerror}") from error
-    if status.st_mode & 0o077:
-        mode = stat.S_IMODE(status.st_mode)
-        raise DashboardError(f"{name} {path}: others can read it (mode {mode:o}): chmod 600 {path}")
+    try:
+        check_private(path, status)
+    except KeyFileError as error:
+        raise DashboardError(f"{name} {error}") from None
     token = content.decode("ascii", "replace").strip()
     if len(content) > _LONGEST_FILE_BYTES or not token.isprintable() or " " in token or "\ufffd" in token:
         raise DashboardError(f"{name} {path}: expected one line of ASCII without spaces")

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from companion.key_files import KeyFileError, check_private
 from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 from vision.extras import install_command
@@ -70,13 +71,19 @@ def endpoint_from(language: LanguageSection) -> Endpoint | None:
     """The language model of the settings; None: sentences are read by patterns. Raises LanguageError."""
     if not language.model:
         return None
-    key = None
-    if language.key_file is not None:
-        try:
-            key = Path(language.key_file).read_text(encoding="utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise LanguageError(f"language.key_file {language.key_file}: cannot be read: {error}") from None
+    key = None if language.key_file is None else read_api_key(Path(language.key_file))
     return endpoint_of(language.url, language.model, key=key, timeout_s=language.timeout_s)
+
+
+def read_api_key(path: Path) -> str:
+    """Read `language.key_file`, a text that only its owner can read. Raises LanguageError."""
+    try:
+        check_private(path, path.stat())
+        return path.read_text(encoding="utf-8").strip()
+    except KeyFileError as error:
+        raise LanguageError(f"language.key_file {error}") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise LanguageError(f"language.key_file {path}: cannot be read: {error}") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ class LanguageSection(Section):
     model: str = ""
     """name of the model; empty: plain sentences are read by patterns, without a model"""
     key_file: str | None = None
-    """file with the endpoint's API key"""
+    """file with the endpoint's API key, readable by its owner only"""
     may: tuple[str, ...] = ()
     """flight commands that need no confirmation by the operator"""
     timeout_s: Annotated[float, Field(ge=1, le=3600)] = 120.0

@@ -14,6 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from companion.key_files import KeyFileError, check_private
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
 
@@ -52,9 +53,10 @@ def read_key(path: str | Path) -> bytes:
         raise SigningKeyError(f"signing key {path}: cannot be read: {error.strerror}") from error
     if not stat.S_ISREG(status.st_mode):
         raise SigningKeyError(f"signing key {path}: expected a regular file")
-    if status.st_mode & 0o077:
-        mode = stat.S_IMODE(status.st_mode)
-        raise SigningKeyError(f"signing key {path}: others can read it (mode {mode:o}): chmod 600 {path}")
+    try:
+        check_private(path, status)
+    except KeyFileError as error:
+        raise SigningKeyError(f"signing key {error}") from None
     if status.st_uid not in (os.geteuid(), 0):
         raise SigningKeyError(f"signing key {path}: owned by another user; change its owner")
     if len(content) == KEY_LENGTH:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from vision.extras import install_command
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
@@ -19,6 +20,7 @@ from vision.runtimes.base import (
     required,
 )
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
+from vision.yolo.checkpoint_pair import is_pair, pair_paths
 from vision.yolo.level_outputs import Head
 from vision.yolo.safe_pickle import CheckpointError
 
@@ -107,10 +109,7 @@ def read_source(path: Path) -> ModelSource:
         if not path.exists():  # checked before torch is imported
             raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}")
         if not installed("torch"):
-            raise RuntimeMissingError(
-                f"{path}: reading a checkpoint needs torch: {install_command('torch')}; or give an export "
-                "of it, which `companion models export` writes where torch is installed"
-            )
+            raise _needs_torch(path)
         if path.suffix == YOLOX_SUFFIX:
             from vision.foreign.yolox import load_yolox
 
@@ -137,6 +136,42 @@ def read_source(path: Path) -> ModelSource:
         strides = (found.stride,)
         return ModelSource(path, kind, found.class_names, found.metadata, strides, None, None, found)
     return ModelSource(path, kind, found.class_names, found.metadata, found.strides, None, found)
+
+
+def _needs_torch(path: Path) -> RuntimeMissingError:
+    return RuntimeMissingError(
+        f"{path}: reading a checkpoint needs torch: {install_command('torch')}; or give an export "
+        "of it, which `companion models export` writes where torch is installed"
+    )
+
+
+def check_model_file(path: Path, runtime: RuntimeName | Literal["auto"] | None) -> None:
+    """Check, without importing a runtime, that a model file is there, of a known kind, and has its runtime.
+
+    Raises:
+        CheckpointError, RuntimeMissingError, RuntimeUnusableError: as `read_source`, for what is seen so far.
+    """
+    if path.is_dir():
+        path = _file_in(path)
+    kind = kind_of(path)
+    files = pair_paths(path) if kind is None and is_pair(path) else (path,)
+    for file in files:
+        if not file.is_file():
+            raise CheckpointError(f"{file}: no such file; {missing_model_advice(file)}")
+        if not os.access(file, os.R_OK):
+            raise CheckpointError(f"{file}: no permission to read it")
+    if kind is None and len(files) == 1:
+        with path.open("rb") as opened:
+            if opened.read(2) != b"PK":  # the zip archive of torch.save
+                raise CheckpointError(f"{path}: neither a checkpoint nor an exported model")
+    if kind is None and not installed("torch"):
+        raise _needs_torch(path)
+    source = ModelSource(path, kind, (), {}, (), None, None)
+    needed = source.runners() if runtime is None or runtime == "auto" else (runtime,)
+    if needed[0] not in source.runners():
+        raise cannot_run(source, needed[0])
+    if not any(map(installed, needed)):
+        required(needed[0])  # raises with what to install
 
 
 def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:

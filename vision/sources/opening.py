@@ -25,7 +25,7 @@ from vision.sources.network import UdpStream, open_http, open_rtsp, without_pass
 from vision.sources.opencv import quiet_opencv
 from vision.sources.paired import TOLERANCE_S, DepthImages, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
-from vision.sources.registry import SOURCES, source
+from vision.sources.registry import SOURCES, OpenSource, source
 from vision.sources.sequential import SequentialSource
 from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import (
@@ -104,18 +104,48 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     if not scheme:
         return _open_path(Path(uri).expanduser(), settings)
+    opened = _opener(scheme, name)(uri, settings)
+    if not isinstance(opened, Source):
+        with contextlib.suppress(Exception):  # a plug-in's own class, or nothing to close
+            opened.close()
+        raise SourceError(f"{name}: the plug-in of {scheme}:// must return a Source, got {shown(opened)}")
+    return opened
+
+
+def check_address(uri: str, settings: SourceSettings) -> None:
+    """Check the address of a source without opening it: its scheme, or that there is such a file or folder.
+
+    Of shared memory and networks there is nothing more to check.
+
+    Raises:
+        SourceUnavailableError: as `check_there`.
+        SourceError: no such scheme, file or folder, or not readable by this user.
+    """
+    check_there(uri)
+    scheme = uri.partition("://")[0] if "://" in uri else ""
+    if uri == "-" or camera_device(uri) is not None:
+        return
+    if scheme in ("", "file"):
+        path = Path(_rest(uri)) if scheme else Path(uri).expanduser()
+        if not os.access(path, os.R_OK):
+            raise SourceError(f"{path}: no permission to read it")
+        return
+    _opener(scheme, without_password(uri))
+    if scheme == "csi":
+        parse_csi_number(uri), csi_settings(uri, settings)
+        check_csi_program(uri)
+    elif scheme == "shm":
+        check_name(_rest(uri))
+
+
+def _opener(scheme: str, name: str) -> OpenSource:
     if (opener := SOURCES.get(scheme)) is None:
         raise SourceError(
             f"{name}: unknown scheme {scheme}://; known: {SOURCES.known()}, cameras "
             "(/dev/video0), files, folders, FIFOs and - for standard input. Schemes of a plug-in are known "
             "once its module is loaded (plugins.modules, --plugins-modules)"
         )
-    opened = opener(uri, settings)
-    if not isinstance(opened, Source):
-        with contextlib.suppress(Exception):  # a plug-in's own class, or nothing to close
-            opened.close()
-        raise SourceError(f"{name}: the plug-in of {scheme}:// must return a Source, got {shown(opened)}")
-    return opened
+    return opener
 
 
 def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Source:
