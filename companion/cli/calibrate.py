@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command, with_default
+from companion.journal import log_to_standard_error
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -94,7 +94,7 @@ def lens(
     from vision.calibration.camera_info import camera_identity, write_camera_info
     from vision.sources import SourceError, SourceSettings, open_source
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
 
     with plain_errors(SourceError, ValueError, OSError):  # CalibrationError is a ValueError
         check_folder(output)
@@ -153,7 +153,7 @@ def extrinsics(
     from vision.sources import SourceError, SourceSettings
     from vision.sources.opening import open_two
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     with plain_errors(SourceError, ValueError, OSError):
         check_folder(output)
         printed = Board.parse(*board, square, marker, dictionary)
@@ -223,7 +223,7 @@ def mount(
     from vision.markers import MarkerKind
     from vision.sources import SourceError, SourceSettings, open_source
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     with plain_errors(SourceError, ValueError, OSError, NoAnswerError, BusError):
         if live and (roll or pitch):
             raise ValueError("--live replaces --roll and --pitch: leave them out")

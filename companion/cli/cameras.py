@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import logging
-import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import plain_errors
+from companion.journal import log_to_standard_error
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -150,7 +150,7 @@ def opened(settings: Settings, uri: str | None) -> Iterator[Source]:
     from companion.plugins import PluginError, load_plugins
     from vision.sources import SourceError, open_source
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     with plain_errors(PluginError, SourceError, OSError):
         load_plugins(settings.plugins.modules)
         try:

@@ -8,6 +8,7 @@ and `run` with 75 if another start may succeed.
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import sys
 from typing import TYPE_CHECKING, Annotated
@@ -36,6 +37,7 @@ from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
 from companion.cli.view import view
+from companion.journal import is_journal, marked_for_journal
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -144,7 +146,7 @@ def config(
 
         with plain_errors(ConfigurationError):
             for line in check_settings(settings):
-                typer.echo(f"companion: {line}", err=True)
+                typer.echo(marked_for_journal(f"companion: {line}", logging.WARNING), err=True)
         return
     typer.echo(to_toml(settings), nl=False)
 
@@ -175,6 +177,10 @@ app.registered_commands.sort(key=_help_position)
 
 def main() -> None:
     """Run the console script."""
+    if is_journal(2):
+        from companion.operator.line_output import use_for_standard_error
+
+        use_for_standard_error()
     # End quietly when the reader of a pipe has gone (`| head`).
     if sys.argv[1:2] in (["detect"], ["echo"], ["preview"], ["depth"]):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)

@@ -19,6 +19,7 @@ from companion.cli.flags import (
     check_seed_options,
     plain_errors,
 )
+from companion.journal import log_to_standard_error
 
 _DEMO_S, _DEMO_AUTOPILOT_S = 150.0, 300.0
 
@@ -69,7 +70,7 @@ def demo(
     from companion.vehicle.driver import LinkError
 
     use_for_standard_error()
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     # The service's events are printed here with their time; do not log them as well.
     service = logging.getLogger("companion.service")
     service.propagate = False
@@ -105,7 +106,7 @@ def _fly_seeds(text: str, processes: int, ray: str | None, *, synthetic: bool, a
     from companion.bench.demo_flight import demos_summary, demos_table, fly_demos
     from companion.campaign import ClusterError, SeedError, seeds_of
 
-    logging.basicConfig(level=logging.ERROR, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.ERROR, "companion: %(message)s")
     with plain_errors(ValueError):
         seeds = seeds_of(text)
     flights = []

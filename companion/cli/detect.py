@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import logging
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, YOLO, plain_errors, warn_rendered_only
+from companion.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 
@@ -87,7 +87,7 @@ def detect(
         from vision.tiling import TiledDetector
         from vision.tracking import Tracker, TrackerSettings
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     tracking = TrackerSettings(keep_confidence=confidence)
     with plain_errors(PluginError, OSError, ValueError):  # CheckpointError is a ValueError
         if save is not None:

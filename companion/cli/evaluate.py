@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +11,7 @@ from typing import Annotated
 import typer
 
 from companion.cli.flags import plain_errors
+from companion.journal import log_to_standard_error
 
 
 def evaluate(
@@ -69,7 +69,7 @@ def evaluate(
     from vision.tiling import TiledDetector
     from vision.yolo.safe_pickle import CheckpointError
 
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.INFO, "%(message)s")
     with plain_errors(CheckpointError, DatasetError, ValueError, OSError):
         data = open_dataset(dataset, split=split, images=images)
         if limit is not None:

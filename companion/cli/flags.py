@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +18,7 @@ import typer
 import typer.core
 import typer.main
 
+from companion.journal import marked_for_journal
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
 
@@ -129,12 +131,12 @@ def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:
     """
     for uri, model in models:
         if not uri.startswith("shm://"):
-            typer.echo(
+            text = (
                 f"companion: the model '{model}' is trained on rendered scenes only and does not work on "
                 "camera images; if these are camera images, run `companion models pull yolo11n`, "
-                "then use --model yolo11n",
-                err=True,
+                "then use --model yolo11n"
             )
+            typer.echo(marked_for_journal(text, logging.WARNING), err=True)
             return
 
 

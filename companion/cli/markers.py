@@ -5,13 +5,13 @@ from __future__ import annotations
 import builtins
 import functools
 import logging
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, check_folder, plain_errors, settings_command, with_default
+from companion.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def detect(
         from companion.markers import print_markers
         from vision.sources import SourceError, SourceSettings, open_source
 
-    logging.basicConfig(level=logging.WARNING, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.WARNING, "companion: %(message)s")
     with plain_errors(ValueError):
         section = _section(settings.markers, dictionary, size)
         if settings.camera.on_gimbal:

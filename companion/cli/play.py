@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, EXIT_FAILED, plain_errors
+from companion.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -81,7 +82,7 @@ def play(
 
     use_for_standard_error()
     level = settings.log.level.upper() if "log.level" in given else "WARNING"
-    logging.basicConfig(level=level, format="companion: %(message)s", stream=sys.stderr)
+    log_to_standard_error(level, "companion: %(message)s")
     # The service's events are printed here with their time; do not log them as well.
     service = logging.getLogger("companion.service")
     service.propagate = False

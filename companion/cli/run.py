@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from companion.cli.flags import EXIT_FAILED, EXIT_PASSING, plain_errors, warn_rendered_only
+from companion.journal import log_to_standard_error
 from companion.tasks import spawn
 from vision.gc_pause import gc_paused
 
@@ -48,9 +49,7 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
 
     # A stalled reader of standard error must not block the service. Before any handler uses the stream.
     output = use_for_standard_error()
-    logging.basicConfig(
-        level=settings.log.level.upper(), format="%(levelname)s %(name)s: %(message)s", stream=sys.stderr
-    )
+    log_to_standard_error(settings.log.level.upper(), "%(levelname)s %(name)s: %(message)s")
     with (
         plain_errors(
             *(ConfigurationError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from companion.cli.flags import plain_errors
+from companion.journal import log_to_standard_error
 
 _DATA = "Your own data"
 
@@ -73,7 +73,7 @@ def train(
     from companion.train import score_lines, train_default, train_on_data
     from vision.yolo.safe_pickle import CheckpointError
 
-    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    log_to_standard_error(logging.INFO, "%(message)s")
     common = _given(seed=seed, steps=steps, workers=workers, threads=threads)
     common["time_limit_s"] = None if hours is None else hours * 3600
     of_data = _given(

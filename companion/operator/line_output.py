@@ -1,19 +1,23 @@
 """A standard error that never blocks the program.
 
 A pipe holds 64 KiB, then a write waits for its reader; a terminal stopped with Ctrl-S holds less. So lines
-are queued, and one thread writes them.
+are queued, and one thread writes them. In systemd's journal a line without a priority, such as one of a
+traceback, is an error.
 """
 
 from __future__ import annotations
 
 import atexit
 import io
+import logging
 import os
 import select
 import sys
 import threading
 import time
 from collections import deque
+
+from companion.journal import is_journal, marked
 
 QUEUED_BYTES = 256 * 1024
 """Capacity of the queue; further lines are dropped and counted."""
@@ -43,6 +47,7 @@ class LineOutput(io.TextIOBase):
         self._lines: deque[bytes] = deque()
         self.queued_bytes = self._unreported = 0
         self._partial = ""
+        self._to_journal = is_journal(descriptor)
         self._writing = self._ended = False
         self._thread = threading.Thread(target=self._run, name="line output", daemon=True)
         self._thread.start()
@@ -75,7 +80,8 @@ class LineOutput(io.TextIOBase):
         self.write(f"{line}\n")
 
     def _put(self, line: str) -> None:
-        data = f"{line}\n".encode("utf-8", "backslashreplace")
+        text = marked(line, logging.ERROR) if self._to_journal else line
+        data = f"{text}\n".encode("utf-8", "backslashreplace")
         if self._ended or self.queued_bytes + len(data) > self._capacity_bytes:
             self._drop(1)
             return
@@ -119,7 +125,8 @@ class LineOutput(io.TextIOBase):
                 if self._unreported and report:
                     count, self._unreported = self._unreported, 0
                     self._writing = True
-                    return f"companion: {count} lines dropped: the output was not read\n".encode()
+                    text = f"companion: {count} lines dropped: the output was not read"
+                    return f"{marked(text, logging.WARNING) if self._to_journal else text}\n".encode()
                 if self._ended:
                     return None
                 self._changed.wait()
@@ -142,9 +149,11 @@ class LineOutput(io.TextIOBase):
 def use_for_standard_error() -> LineOutput | None:
     """Replace standard error by a `LineOutput`.
 
-    The exit of the program waits for the reader a second at most. Returns None, and changes nothing, if
-    standard error has no descriptor.
+    The exit of the program waits for the reader a second at most. Returns the one that is in use, if any;
+    None, and changes nothing, if standard error has no descriptor.
     """
+    if isinstance(sys.stderr, LineOutput):
+        return sys.stderr
     try:
         descriptor = sys.stderr.fileno()
     except (AttributeError, OSError):  # closed, or a buffer in a test

@@ -15,6 +15,7 @@ import stat
 from collections.abc import Callable, Coroutine
 from typing import TypeVar
 
+from companion.journal import is_journal
 from companion.tasks import spawn
 
 _T = TypeVar("_T")
@@ -79,15 +80,10 @@ async def _watch_readers(end: Callable[[], object]) -> None:
 
 
 def _with_readers() -> list[int]:
-    """The outputs to watch: not the sockets of systemd's journal, which may restart.
-
-    JOURNAL_STREAM is device and inode of one of them. What a unit starts inherits it, such as a terminal of
-    the desktop and all of its programs, whose outputs are others.
-    """
+    """The outputs to watch: not the sockets of systemd's journal, which may restart."""
     found = dict[int, os.stat_result]()
     for descriptor in _OUTPUTS:
         with contextlib.suppress(OSError):  # closed
             found[descriptor] = os.fstat(descriptor)
-    journal = os.environ.get("JOURNAL_STREAM")
-    to_journal = any(f"{each.st_dev}:{each.st_ino}" == journal for each in found.values())
+    to_journal = any(map(is_journal, found))
     return [number for number, each in found.items() if not (to_journal and stat.S_ISSOCK(each.st_mode))]
