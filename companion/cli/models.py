@@ -16,7 +16,10 @@ models = typer.Typer(help="List, inspect, download, export and verify models.", 
 _JSON = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 _FOLDER = Annotated[
     Path | None,
-    typer.Option(help="Models folder. Default: $COMPANION_MODELS_FOLDER, else one in your data folder."),
+    typer.Option(
+        help="Models folder. Default: $COMPANION_MODELS_FOLDER, else /var/lib/companion/models where you may "
+        "write it, else one in your data folder; the last two are both read."
+    ),
 ]
 
 
@@ -24,14 +27,14 @@ _FOLDER = Annotated[
 def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
     """List bundled, local and official models."""
     from companion.models.info import list_rows
-    from vision.model_files import models_folder
+    from vision.model_files import models_folders
 
-    searched = folder or models_folder()
-    rows = list_rows(searched)
+    searched = (folder,) if folder is not None else models_folders()
+    rows = list_rows(*searched)
     if as_json:
-        typer.echo(json.dumps({"folder": str(searched), "models": rows}))
+        typer.echo(json.dumps({"folders": list(map(str, searched)), "models": rows}))
         return
-    typer.echo(f"models folder: {searched}")
+    typer.echo(f"models folders: {', '.join(map(str, searched))}")
     width = max(len(row["name"]) for row in rows)
     for row in rows:
         size = "       " if row["size_bytes"] is None else f"{row['size_bytes'] / 1e6:5.1f} MB"

@@ -124,9 +124,9 @@ def info_lines(info: ModelInfo) -> list[str]:
     return [f"{name:<{width}}  {value}" for name, value in rows.items()]
 
 
-def list_rows(folder: Path) -> list[dict[str, Any]]:
-    """Return every model: bundled, in `folder`, and official; with a `state` each."""
-    kept = {path.name: path for path in kept_models(folder)}
+def list_rows(*folders: Path) -> list[dict[str, Any]]:
+    """Return every model: bundled, in `folders`, and official; with a `state` each."""
+    kept = {path.name: path for path in kept_models(*folders)}
     rows: list[dict[str, Any]] = [
         {
             "name": "default",
@@ -155,7 +155,7 @@ def list_rows(folder: Path) -> list[dict[str, Any]]:
             "state": "here",
             "size_bytes": path.stat().st_size,
             "licence": None,
-            "about": "in the models folder",
+            "about": f"in {path.parent}",
             "path": str(path),
         }
         for path in kept.values()

@@ -81,6 +81,54 @@ def test_bare_name_is_found_in_models_folder(folder: Path, small_model: Path) ->
     assert json.loads(run("info", "mine", "--json"))["file"] == str(folder / "mine.pt")
 
 
+@pytest.fixture
+def two_folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, Path]:
+    """The user's folder and the system's, which do not exist yet."""
+    monkeypatch.delenv("COMPANION_MODELS_FOLDER")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr("vision.model_files.SYSTEM_FOLDER", tmp_path / "system" / "models")
+    return tmp_path / "data" / "mavlink-companion" / "models", tmp_path / "system" / "models"
+
+
+def test_model_in_system_folder_is_found_by_all(two_folders: tuple[Path, Path]) -> None:
+    own, system = two_folders
+    system.mkdir(parents=True)
+    for name in ("pulled.pt", "both.pt"):
+        (system / name).write_bytes(b"system")
+    assert find_model("pulled") == system / "pulled.pt"
+    assert find_model("both") == system / "both.pt"
+    own.mkdir(parents=True)
+    for name in ("both.pt", "own.onnx"):
+        (own / name).write_bytes(b"own")
+    assert find_model("both") == own / "both.pt"
+    assert kept_models() == [own / "both.pt", own / "own.onnx", system / "pulled.pt"]
+    rows = json.loads(run("list", "--json"))["models"]
+    assert {row["path"] for row in rows if row["state"] == "here"} == set(map(str, kept_models()))
+
+
+def test_model_is_put_where_the_service_finds_it(
+    two_folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, system = two_folders
+    assert models_folder() == system
+    writable = {own.parent.parent.parent}
+    monkeypatch.setattr("os.access", lambda path, _mode: path in writable)
+    system.mkdir(parents=True)
+    assert models_folder() == own
+    writable.add(system)
+    assert models_folder() == system
+
+
+def test_unreadable_folder_does_not_hide_the_next(two_folders: tuple[Path, Path]) -> None:
+    own, system = two_folders
+    system.mkdir(parents=True)
+    (system / "pulled.pt").write_bytes(b"system")
+    own.parent.parent.mkdir()
+    own.parent.write_bytes(b"no folder")  # as root may read every folder
+    assert find_model("pulled") == system / "pulled.pt"
+    assert kept_models() == [system / "pulled.pt"]
+
+
 def test_info_describes_model() -> None:
     facts = json.loads(run("info", "default", "--runtime", "torch", "--json"))
     assert facts["model_family"] == "YOLOv8"
