@@ -45,7 +45,7 @@ def test_wheel_holds_the_packages_and_their_data(tmp_path: Path) -> None:
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/guidance/policies/*.onnx")}
     wanted |= {f"{package}/py.typed" for package in packages}
     assert wanted <= set(names), sorted(wanted - set(names))
-    for unit in ("companion.service", "companion.toml"):
+    for unit in ("companion.service", "companion@.service", "companion.toml"):
         assert any(name.endswith(f"share/mavlink-companion/systemd/{unit}") for name in names)
 
 

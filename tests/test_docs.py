@@ -22,7 +22,7 @@ DOCUMENTS = [
     ROOT / "CONTRIBUTING.md",
     ROOT / "SECURITY.md",
     *sorted((ROOT / "docs").glob("**/*.md")),
-    ROOT / "systemd" / "companion.service",
+    *sorted((ROOT / "systemd").glob("*.service")),
 ]
 command_of = functools.cache(typer.main.get_command)
 APPS = {"companion": companion_app, "mavlink-sim": simulator_app}

@@ -50,7 +50,12 @@ def journal_of(program: list[str], cwd: Path, *, other: bool = False) -> tuple[i
         inode = status.st_ino + (1 if other else 0)
         environment = {**os.environ, "JOURNAL_STREAM": f"{status.st_dev}:{inode}", "NO_COLOR": "1"}
         process = subprocess.Popen(
-            program, stdout=theirs, stderr=theirs, stdin=subprocess.DEVNULL, cwd=cwd, env=environment
+            program,
+            stdout=theirs.fileno(),
+            stderr=theirs.fileno(),
+            stdin=subprocess.DEVNULL,
+            cwd=cwd,
+            env=environment,
         )
         theirs.close()
         lines = reader.read().decode().splitlines()
