@@ -31,7 +31,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Literal
 
 Reply = dict[str, Any]
-"""`command`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
+"""`id`, `command`, `state`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
 
 NON_FLIGHT = frozenset({NON_FLIGHT})
 """Commands that leave the vehicle's flight as it is, or that end it."""

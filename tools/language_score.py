@@ -70,6 +70,9 @@ class Recorder:
     async def control(self) -> Control:
         return Control()
 
+    def ending(self, reply: dict[str, Any]) -> None:
+        return None
+
     async def state(self) -> dict[str, Any]:
         return {"mode": "HOLD", "height_above_home_m": 5.0, "heading_deg": 90, "battery_percent": 81}
 

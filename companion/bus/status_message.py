@@ -10,10 +10,12 @@ from companion.bus.bodies.service import (
     PartBody,
     StatusBody,
     StatusCameraBody,
+    StatusCommandBody,
     StatusGimbalBody,
     StatusMissionBody,
 )
 from companion.bus.session import Bus
+from companion.bus.topics import command_id
 from companion.geometry.fence import Polygon
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.core import Guidance
@@ -91,6 +93,7 @@ def status_message(
             "stream": streamer.state.value,
             "setpoints_sent": streamer.sent_count,
             "mission": _mission(guidance.behaviour),
+            "command": _command(guidance, poses.source),
         },
         "limits": {
             "max_distance_m": limits.max_distance_m,
@@ -122,6 +125,13 @@ def status_message(
         },
         "log": {"dropped_lines": dropped_lines},
     }
+
+
+def _command(guidance: Guidance, service: str) -> StatusCommandBody | None:
+    command = guidance.command
+    if command is None:
+        return None
+    return {"id": command_id(service, command.identifier), "command": command.text}
 
 
 def _mission(behaviour: Behaviour | None) -> StatusMissionBody | None:

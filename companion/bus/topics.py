@@ -22,7 +22,7 @@ from companion.bus.bodies.frames import (
     TracksBody,
     TransformsBody,
 )
-from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.service import CommandStateBody, EventBody, StatusBody
 from companion.bus.bodies.vehicle import ObstaclesBody, PoseBody, SetpointsBody, VehicleBody, VelocityBody
 
 ROOT = "companion"
@@ -235,6 +235,14 @@ EVENTS: Final = Topic(
     cached=100,
 )
 
+COMMAND_STATE: Final = Topic(
+    "command_state",
+    CommandStateBody,
+    "a command of any sender was accepted, is in progress, or has ended, and why",
+    "on occurrence",
+    cached=100,
+)
+
 # Received by the service.
 VELOCITY: Final = Topic(
     "velocity",
@@ -300,6 +308,7 @@ TOPICS: Final = (
     POSE,
     STATUS,
     EVENTS,
+    COMMAND_STATE,
 )
 
 # Those that the service receives.
@@ -315,6 +324,12 @@ RECORDER_TOPICS: Final = (RUN, GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK)
 
 # The last part of the key of the queryable that executes a command and returns its result.
 COMMAND: Final = "command"
+
+
+def command_id(service: str, number: int) -> str:
+    """Return the `id` of a command: `service` of its service's status, and its number there."""
+    return f"{service}-{number}"
+
 
 NO_OBJECTS = "no objects detected"
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Any, Literal
 
 Reply = dict[str, Any]
-"""`command`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
+"""`id`, `command`, `state`, `success`, `reason`; of a mission also `steps`, of select `track` and `class`."""
 
 NON_FLIGHT = frozenset({"gimbal", "select", "stop"})
 """Commands that leave the vehicle's flight as it is, or that end it."""

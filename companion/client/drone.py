@@ -7,9 +7,9 @@ import json
 import threading
 import time
 import uuid
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import zenoh
@@ -17,12 +17,13 @@ from pydantic import TypeAdapter, ValidationError
 
 from companion.bus import topics
 from companion.bus.bodies.frames import DepthBody, DetectionsBody, MarkersBody, TracksBody
-from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.service import CommandStateBody, EventBody, StatusBody
 from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBody
 from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
 from companion.client.commands import NON_FLIGHT, Commands, Reply
+from companion.client.endings import Endings
 from companion.client.stream import Stream
-from companion.peer_data import PeerDataError, copy_payload, parse_json, parse_object
+from companion.peer_data import copy_payload, parse_json, parse_object
 from companion.settings import ZenohSection
 
 # Longer than any command; a caller's `asyncio.timeout` ends it earlier.
@@ -47,7 +48,7 @@ class Steering:
 
     def __init__(self, publisher: zenoh.Publisher, source: str) -> None:
         self._publisher, self.source = publisher, source
-        self._statuses, self._replaced_by = 0, ""
+        self._ended: Callable[[], CommandStateBody | None] = lambda: None
 
     def send(
         self,
@@ -68,13 +69,10 @@ class Steering:
 
         Raises:
             ValueError: a value is not finite or out of range.
-            CommandFailedError: the command has ended, as far as `status` has shown it, within about 2 s.
+            CommandFailedError: the command has ended; its reason says why.
         """
-        if self._replaced_by:
-            reason = f"ended, the vehicle flies something else: {self._replaced_by}"
-            raise CommandFailedError(
-                {"command": f"velocity source={self.source}", "success": False, "reason": reason}
-            )
+        if (ended := self._ended()) is not None:
+            raise CommandFailedError({**ended, "success": False, "reason": f"ended: {ended['reason']}"})
         self._put(forward, right, up, turn, lifetime)
 
     def end(self) -> None:
@@ -99,17 +97,6 @@ class Steering:
             raise ValueError(f"{name}: {first['msg']}, got {first['input']}") from None
         self._publisher.put(json.dumps(body))
 
-    def _on_status(self, sample: zenoh.Sample) -> None:
-        try:
-            status = parse_object(copy_payload(sample.payload, topics.STATUS.largest_bytes))
-            behaviour = str(status["pilot"]["behaviour"])
-        except (PeerDataError, KeyError, TypeError):
-            return  # another program's
-        self._statuses += 1
-        # The first one may have been made before the command began.
-        own = self._statuses == 1 or behaviour.startswith(f"velocity of {self.source}")
-        self._replaced_by = "" if own else behaviour
-
 
 @cache
 def _velocity_body() -> TypeAdapter[VelocityBody]:
@@ -117,7 +104,8 @@ def _velocity_body() -> TypeAdapter[VelocityBody]:
 
 
 class Drone(Commands):
-    """One vehicle. Its commands wait until they have ended; an endless one until the vehicle flies it.
+    """One vehicle. Its commands wait until they have ended; an endless one until the vehicle flies it, and
+    `ended` waits for its end.
 
     Cancelling a waiting command sends `stop`. A command that is refused or fails raises CommandFailedError.
 
@@ -130,6 +118,7 @@ class Drone(Commands):
         # One for all its steering: the last message of the one before is still valid at the next.
         self._source = f"client-{uuid.uuid4().hex[:8]}"
         self._steering: Steering | None = None
+        self._endings: Endings | None = None
 
     @property
     def session(self) -> zenoh.Session:
@@ -162,6 +151,24 @@ class Drone(Commands):
             raise CommandFailedError(reply)
         return reply
 
+    async def ended(self, reply: Reply) -> CommandStateBody:
+        """Wait until a command has ended; returns its last message, with `success` and `reason`.
+
+        An endless command ends when another one replaces it, by `stop`, or when the vehicle is flown by
+        something else: a pilot, a failsafe. Raises nothing for such an end.
+
+        Args:
+            reply: of the command, as its method has returned it.
+
+        Raises:
+            NoAnswerError: the service has gone meanwhile.
+        """
+        return await self._watched().wait(str(reply["id"]))
+
+    def ending(self, reply: Reply) -> CommandStateBody | None:
+        """How a command has ended, as `ended` returns it; None: it has not, as far as known here."""
+        return self._watched().of(str(reply.get("id")))
+
     async def _stop(self, outcome: asyncio.Future[Reply]) -> None:
         """End a command: `stop`, again if the command reached the service, or became active, after it."""
         for _ in range(3):
@@ -176,6 +183,7 @@ class Drone(Commands):
 
     def _send(self, text: str, timeout_s: float) -> asyncio.Future[Reply]:
         """Send a command from a thread of its own: a pool would let endless ones delay a `stop`."""
+        self._watched()
         loop = asyncio.get_running_loop()
         outcome: asyncio.Future[Reply] = loop.create_future()
         outcome.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may not be awaited
@@ -199,6 +207,11 @@ class Drone(Commands):
         threading.Thread(target=send, name=f"command {self.name}", daemon=True).start()
         return outcome
 
+    def _watched(self) -> Endings:
+        if self._endings is None:
+            self._endings = Endings(self._session, self.name)
+        return self._endings
+
     @asynccontextmanager
     async def steer(self) -> AsyncIterator[Steering]:
         """Begin the command `velocity` for this program's messages; afterwards the vehicle brakes and holds.
@@ -219,12 +232,12 @@ class Drone(Commands):
         ) as publisher:
             self._steering = steering = Steering(publisher, self._source)
             try:
-                await self.velocity(source=self._source)
-                with self._session.declare_subscriber(topics.STATUS.key(self.name), steering._on_status):
-                    try:
-                        yield steering
-                    finally:
-                        steering.end()
+                begun = await self.velocity(source=self._source)
+                steering._ended = partial(self._watched().of, str(begun.get("id")))
+                try:
+                    yield steering
+                finally:
+                    steering.end()
             finally:
                 self._steering = None
 
@@ -276,6 +289,10 @@ class Drone(Commands):
     def events(self, *, size: int = 100) -> Stream[EventBody]:
         """Events of the service, the kept ones first."""
         return self._stream(topics.EVENTS, None, size)
+
+    def command_states(self, *, size: int = 100) -> Stream[CommandStateBody]:
+        """States of the commands of every sender, the kept ones first."""
+        return self._stream(topics.COMMAND_STATE, None, size)
 
     def image(self, camera: str | None = None, *, size: int = 1) -> Stream[bytes]:
         """Preview images, JPEG."""

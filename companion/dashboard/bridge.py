@@ -21,6 +21,7 @@ import zenoh
 
 from companion.bus.client import image_of, subscribe_kept
 from companion.bus.topics import (
+    COMMAND_STATE,
     DETECTIONS,
     EVENTS,
     IMAGE,
@@ -62,13 +63,14 @@ class News:
     Attributes:
         number: the newest. topics: path → JSON text of the newest message, if it is new.
         ages_s: path → seconds since the newest message arrived, of all topics.
-        events: in the order of arrival.
+        events: in the order of arrival. command_states: of all commands, likewise.
     """
 
     number: int
     topics: dict[str, str]
     ages_s: dict[str, float]
     events: list[dict[str, Any]]
+    command_states: list[dict[str, Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +120,7 @@ class Bridge:
         self._topics: dict[str, _Message] = {}
         # With their numbers in the order of arrival.
         self._events: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_EVENTS)
+        self._command_states: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_EVENTS)
         self._lock = threading.Lock()
         self._number = 0
         self._cameras: dict[str, _Camera] = {}
@@ -147,7 +150,11 @@ class Bridge:
         keys = [topic.key(self.vehicle) for topic in (DETECTIONS, VEHICLE, SETPOINT)]
         for key in (*keys, DETECTIONS.key(self.vehicle, "*")):
             self._subscribers.append(session.declare_subscriber(key, self._on_state))
-        for topic, receive in ((STATUS, self._on_state), (EVENTS, self._on_event)):
+        for topic, receive in (
+            (STATUS, self._on_state),
+            (EVENTS, self._on_event),
+            (COMMAND_STATE, self._on_command_state),
+        ):
             self._subscribers.append(subscribe_kept(session, topic.key(self.vehicle), receive))
         self._subscribed_s = time.monotonic()
 
@@ -211,6 +218,7 @@ class Bridge:
                 topics={path: kept.text for path, kept in self._topics.items() if kept.number > after},
                 ages_s={path: round(now_s - kept.received_s, 2) for path, kept in self._topics.items()},
                 events=[event for number, event in self._events if number > after],
+                command_states=[state for number, state in self._command_states if number > after],
             )
 
     def end_leases(self) -> None:
@@ -249,15 +257,23 @@ class Bridge:
                 if len(self._sightings) > MAX_TRACKS:
                     del self._sightings[next(iter(self._sightings))]
 
+    def _keep(self, kept: deque[tuple[int, dict[str, Any]]], value: dict[str, Any]) -> bool:
+        """Append a message; False: it is one of those that the service keeps, and was received before."""
+        with self._lock:
+            if any(each == value for _, each in kept):
+                return False
+            self._number += 1
+            kept.append((self._number, value))
+            return True
+
+    def _on_command_state(self, sample: zenoh.Sample) -> None:
+        if (value := _json(sample)) is not None:
+            self._keep(self._command_states, value)
+
     def _on_event(self, sample: zenoh.Sample) -> None:
         value = _json(sample)
-        if value is None:
+        if value is None or not self._keep(self._events, value):
             return
-        with self._lock:
-            if any(event == value for _, event in self._events):
-                return  # kept by the service, and received before
-            self._number += 1
-            self._events.append((self._number, value))
         loop = self._link.loop
         if str(value.get("text")).startswith("command: ") and loop is not None and not loop.is_closed():
             loop.call_soon_threadsafe(self._link.on_command, self.vehicle)

@@ -174,7 +174,7 @@ class Fleet:
 
         def finish(reply: dict[str, Any]) -> None:
             self._waiting[vehicle, stop] -= 1
-            answer = {**reply, **about}
+            answer = {**reply, "command_id": reply.get("id"), **about}
             self._number += 1
             self._replies.append((self._number, answer))
             outcome.set_result(answer)

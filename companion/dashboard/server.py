@@ -388,6 +388,7 @@ def _text_of(
         "alive": bridge.alive,
         "ages_s": news.ages_s,
         "events": news.events,
+        "command_states": news.command_states,
         "replies": replies,
         "windows": windows,
         "chat": chat,

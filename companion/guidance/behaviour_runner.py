@@ -49,6 +49,7 @@ class BehaviourRunner:
         gimbal_user: name of the behaviour that moves the gimbal; empty: none.
         goal_ned_m: where the behaviour before wanted the vehicle; None: unknown.
         failure: exception of the step before, in words; empty: none.
+        command: the command of `behaviour`; None: it has none.
     """
 
     def __init__(
@@ -76,7 +77,8 @@ class BehaviourRunner:
         self._battery = BatteryMonitor(battery)
         self._queue = queue
         self._out = out
-        self._command: CommandInput | None = None
+        self.command: CommandInput | None = None
+        self._answered = False
         self._after_battery = self._activated = False
         self._stepped_ns: int | None = None
         self._position_lost_ns: int | None = None
@@ -121,12 +123,13 @@ class BehaviourRunner:
 
     def answer_endless(self, inputs: GuidanceInput) -> None:
         """Answer an endless command when the vehicle flies it."""
-        command = self._command
-        if command is None or not command.endless or self._modes.phase is not Phase.OFFBOARD:
+        command = self.command
+        if command is None or not command.endless or self._answered:
             return
-        if inputs.state.mode is FlightMode.OFFBOARD and inputs.stream.state is StreamState.FRESH:
-            self._out.result(command.identifier, self._with_takeover(Outcome(True, "in progress")))
-            self._command = None
+        offboard = self._modes.phase is Phase.OFFBOARD and inputs.state.mode is FlightMode.OFFBOARD
+        if offboard and inputs.stream.state is StreamState.FRESH:
+            self._out.in_progress(command.identifier, self._with_takeover(Outcome(True, "in progress")))
+            self._answered = True
 
     def end_after_standstill(self, why: str) -> None:
         """The computer or the process stood still: our command ends in every phase."""
@@ -162,10 +165,10 @@ class BehaviourRunner:
         self.goal_ned_m = None
 
     def end(self, outcome: Outcome, *, reported: bool = False) -> None:
-        """Remove the active behaviour and answer its command."""
-        behaviour, command, busy = self.behaviour, self._command, self.busy
+        """Remove the active behaviour; its command has ended."""
+        behaviour, command, busy = self.behaviour, self.command, self.busy
         after_battery, self._after_battery = self._after_battery, False
-        self.behaviour = self._command = self.active = self.approached = None
+        self.behaviour = self.command = self.active = self.approached = None
         self.busy, self._landing, self.gimbal_user = False, False, ""
         self.needs = frozenset()
         if behaviour is None:
@@ -176,7 +179,7 @@ class BehaviourRunner:
             except Exception:
                 logger.exception("%s failed to deactivate", behaviour.name)
         if command is not None:
-            self._out.result(command.identifier, self._with_takeover(outcome))
+            self._out.ended(command.identifier, self._with_takeover(outcome), answered=self._answered)
         self._took_over = ""
         if after_battery:
             # No command waits for its result: log how it ended.
@@ -185,7 +188,8 @@ class BehaviourRunner:
             self._out.event(EventKind.ENDED, behaviour.name, outcome.reason, outcome)
 
     def _begin(self, behaviour: Behaviour, command: CommandInput | None, *, busy: bool = True) -> None:
-        self.behaviour, self._command, self.busy = behaviour, command, busy
+        self.behaviour, self.command, self.busy = behaviour, command, busy
+        self._answered = False
         if command is None:
             self._modes.decide_alone()
         self._activated, self._position_lost_ns = False, None
@@ -248,8 +252,8 @@ class BehaviourRunner:
         A vehicle that we have armed and that is still on the ground is not held there, but disarmed.
         """
         behaviour = self.behaviour
-        if behaviour is not None and self.busy and self._command is None and not self._after_battery:
-            # An endless command was answered when it began: nobody waits for how it ends.
+        if behaviour is not None and self.busy and self._answered:
+            # An endless command was answered when it began: its reply does not say how it ends.
             text = f"{behaviour.name} ended: {outcome.reason}"
             self._out.event(EventKind.NOTED, behaviour.name, text, warning=not outcome.success)
         self.end(outcome)

@@ -58,11 +58,11 @@ class CommandQueue:
         """Add a new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none."""
         self.supersede(command.text, out)
         if command.mode_changes not in (None, self._mode_changes):
-            out.result(command.identifier, Outcome(False, f"superseded by {_change(context.state)}"))
+            out.ended(command.identifier, Outcome(False, f"superseded by {_change(context.state)}"))
             return
         if command.aim is not None and gimbal_user:
             reason = f"gimbal: in use by {gimbal_user}; end that behaviour first"
-            out.result(command.identifier, Outcome(False, reason))
+            out.ended(command.identifier, Outcome(False, reason))
             return
         if not (awaited := _awaited(command, context)):
             self._due.append(command)
@@ -88,14 +88,14 @@ class CommandQueue:
                 left.append(waiting)
             else:
                 reason = f"superseded by {by} while waiting for {waiting.awaited}"
-                out.result(waiting.command.identifier, Outcome(False, reason))
+                out.ended(waiting.command.identifier, Outcome(False, reason))
         self._waiting = left
 
     def close(self, out: OutputCollector) -> None:
         """The service ends: answer every waiting command."""
         self.supersede("the end of the service", out)
         for waiting in self._waiting:
-            out.result(waiting.command.identifier, Outcome(False, ENDING))
+            out.ended(waiting.command.identifier, Outcome(False, ENDING))
         self._waiting = []
 
     def take_due(self, context: BehaviourContext, out: OutputCollector) -> list[CommandInput]:

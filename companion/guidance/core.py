@@ -136,6 +136,11 @@ class Guidance:
         return self._setpoints.path
 
     @property
+    def command(self) -> CommandInput | None:
+        """The command that has begun and not ended; None: none has."""
+        return self._runner.command
+
+    @property
     def phase(self) -> Phase:
         """State of our command."""
         return self._modes.phase
@@ -194,7 +199,7 @@ class Guidance:
         if inputs.ending:
             self._queue.close(out)
             for command in inputs.commands:
-                out.result(command.identifier, Outcome(False, ENDING))
+                out.ended(command.identifier, Outcome(False, ENDING))
             self._runner.end(Outcome(False, ENDING))
             self._modes.release()
             self.gimbal.end(now_ns, inputs.state, out)
@@ -204,7 +209,7 @@ class Guidance:
             self._end_after(inputs.standstill, now_ns)
         for command in inputs.commands:
             if (why := self._outdated(command, inputs.standstill, now_ns)) is not None:
-                out.result(command.identifier, Outcome(False, why))
+                out.ended(command.identifier, Outcome(False, why))
                 continue
             self._queue.add(command, context, self._runner.gimbal_user, out)
         for command in self._queue.take_due(context, out):
@@ -337,6 +342,7 @@ class Guidance:
             tuple(out.events),
             tuple(out.results),
             released,
+            tuple(out.endings),
         )
 
     def _begin_command(self, command: CommandInput, context: BehaviourContext) -> None:
@@ -354,7 +360,7 @@ class Guidance:
             missing = f"{behaviour.name} cannot begin: {type(error).__name__}: {error}"
         if missing is not None:
             outcome = Outcome(False, missing)
-            self._out.result(command.identifier, outcome)
+            self._out.ended(command.identifier, outcome)
             self._out.event(EventKind.REFUSED, behaviour.name, f"refused: {missing}", outcome)
             return
         self._closing.reset()

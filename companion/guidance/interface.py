@@ -144,7 +144,7 @@ class CommandInput:
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """The result of a command: ended, refused, or in progress (an endless one)."""
+    """The result of a command: ended, refused, or in progress (an endless one); in `endings` how it ended."""
 
     identifier: int
     outcome: Outcome
@@ -247,6 +247,9 @@ class GuidanceOutput:
         landing_target: for the autopilot, once per frame that shows one.
         path_request: what path to plan around obstacles; None: none is needed.
         obstacle_distance: for the autopilot's collision prevention, 10 times a second; never stale.
+        results: the answers of commands, one each. endings: of commands that have ended or were refused, also
+            of those that were answered when they began; a command has one. Not recorded: the topic
+            `command_state` is.
         released: after `ending`: no request is pending and no control is held.
     """
 
@@ -259,6 +262,7 @@ class GuidanceOutput:
     events: tuple[GuidanceEvent, ...] = ()
     results: tuple[CommandResult, ...] = ()
     released: bool = False
+    endings: tuple[CommandResult, ...] = field(default=(), metadata={"recorded": False})
 
 
 @dataclass(slots=True)
@@ -270,12 +274,13 @@ class OutputCollector:
     cancelled: list[int] = field(default_factory=list)
     events: list[GuidanceEvent] = field(default_factory=list)
     results: list[CommandResult] = field(default_factory=list)
+    endings: list[CommandResult] = field(default_factory=list)
     _identifier: int = 0
 
     def begin(self, now_ns: int) -> None:
         """A new step."""
         self.now_ns = now_ns
-        self.requests, self.cancelled, self.events, self.results = [], [], [], []
+        self.requests, self.cancelled, self.events, self.results, self.endings = [], [], [], [], []
 
     def request(self, action: Action, commanded_ns: int | None = None) -> int:
         """Add a request; returns its identifier.
@@ -310,7 +315,12 @@ class OutputCollector:
         level: Literal["info", "warning"] = "warning" if warning else "info"
         self.events.append(GuidanceEvent(self.now_ns, kind, behaviour, message, outcome, level))
 
-    def result(self, identifier: int | None, outcome: Outcome) -> None:
-        """Answer a command; None: no command, or it was answered before."""
-        if identifier is not None:
+    def in_progress(self, identifier: int, outcome: Outcome) -> None:
+        """Answer a command that goes on."""
+        self.results.append(CommandResult(identifier, outcome))
+
+    def ended(self, identifier: int, outcome: Outcome, *, answered: bool = False) -> None:
+        """A command has ended or is refused; answer it, unless it was answered when it began."""
+        self.endings.append(CommandResult(identifier, outcome))
+        if not answered:
             self.results.append(CommandResult(identifier, outcome))

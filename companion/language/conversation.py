@@ -14,6 +14,7 @@ from collections.abc import Awaitable, Callable, Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
+from companion.bus.bodies.service import CommandStateBody
 from companion.client.commands import NON_FLIGHT, Reply
 from companion.guidance.command import Command, GrammarError
 from companion.guidance.missions.mission_file import Mission, describe, plan_from
@@ -55,6 +56,9 @@ class Vehicle(Protocol):
 
     async def control(self) -> Control:
         """Who controls the vehicle."""
+
+    def ending(self, reply: Reply) -> CommandStateBody | None:
+        """How the command of a reply has ended since; None: it has not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +292,9 @@ async def answer_to(question: Question, vehicle: Vehicle, newest: Reply | None) 
     if question.name == "battery":
         return {"battery_percent": state.get("battery_percent")}
     if question.name == "why_not":
-        return {"newest_command": None if newest is None else newest.get("reason"), "warnings": warnings}
+        ended = None if newest is None else vehicle.ending(newest)
+        last = newest if ended is None else ended
+        return {"newest_command": None if last is None else last.get("reason"), "warnings": warnings}
     return state
 
 

@@ -15,7 +15,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody
-from companion.bus.bodies.service import EventBody, StatusBody, StatusCameraBody
+from companion.bus.bodies.service import CommandStateBody, EventBody, StatusBody, StatusCameraBody
 from companion.bus.client import image_of
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
@@ -126,6 +126,10 @@ class LiveVehicle:
             return Control("no state received from the service", active=self._commands.active)
         mode = vehicle["mode"] if vehicle["armed"] else ""
         return Control(self._commands.lost, mode, self._commands.active)
+
+    def ending(self, reply: Reply) -> CommandStateBody | None:
+        """How the command of a reply has ended since; None: it has not."""
+        return self._drone.ending(reply)
 
     async def forget_loss(self) -> None:
         """A loss of command until now does not count."""

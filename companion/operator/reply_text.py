@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 ENDED_BY_STOP = "ended by stop"  # the answer to a sentence that a stop ended
-_IN_PROGRESS = "in progress"  # begins the reason in the reply to an accepted endless command
 
 
 def reply_text(reply: Mapping[str, Any]) -> str:
-    """`done: REASON`, `failed: REASON`, or `accepted, in progress`. reply: `success` and `reason`."""
-    if reply["success"] and reply["reason"].startswith(_IN_PROGRESS):
+    """`done: REASON`, `failed: REASON`, or `accepted, in progress`. reply: `success`, `reason`, `state`."""
+    if reply.get("state") == "in_progress":
         return f"accepted, {reply['reason']}"
     return f"{'done' if reply['success'] else 'failed'}: {reply['reason']}"

@@ -1,15 +1,17 @@
-"""Parses command texts, passes them to guidance and returns their results."""
+"""Parses command texts, passes them to guidance, returns their results and publishes their states."""
 
 from __future__ import annotations
 
 import asyncio
 import itertools
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
+from companion.bus.bodies.service import CommandStateBody
 from companion.bus.command_intake import Allowance
+from companion.bus.topics import command_id
 from companion.clock import boottime_ns
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.select import Select
@@ -39,6 +41,8 @@ class CommandHandler:
         on_command: called when a command waits for guidance's next step.
         on_event: called with (level, text) for the operator.
         check_requirements: returns why a command may not go to guidance, or None.
+        on_state: called with every state of every command; the last one of each is its end.
+        service: begins the identifiers in those states.
     """
 
     def __init__(
@@ -49,13 +53,17 @@ class CommandHandler:
         on_event: Callable[[str, str], None],
         *,
         check_requirements: Callable[[CommandInput], str | None],
+        on_state: Callable[[CommandStateBody], None],
+        service: str,
     ) -> None:
         self._read, self._on_command, self._on_event = read, on_command, on_event
         self._select = select
         self._check_requirements = check_requirements
+        self._on_state, self._service = on_state, service
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
-        self._awaited: dict[int, asyncio.Future[Outcome]] = {}
+        self._awaited: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._open: dict[int, CommandInput] = {}
         self._reported, self._stops_reported = (Allowance(REPORTED_PER_S, REPORTED_AT_ONCE) for _ in range(2))
         self._unreported = 0
         self._reading = self._closed = False
@@ -65,13 +73,14 @@ class CommandHandler:
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command and return its result. See `Service.command`."""
         received_ns = time.monotonic_ns()  # a file is read for up to `READING_S`
+        identifier = next(self._identifiers)
         try:
-            command = await self._parse(next(self._identifiers), text)
+            command = await self._parse(identifier, text)
         except GrammarError as error:
             first_line = text.strip().partition("\n")[0]
-            return {"command": first_line, "success": False, "reason": "; ".join(str(error).splitlines())}
+            return self._ended(identifier, first_line, Outcome(False, "; ".join(str(error).splitlines())))
         if isinstance(command, Select):
-            return await self._select_object(command)
+            return await self._select_object(identifier, command)
         command = replace(command, received_ns=received_ns)
         is_stop = isinstance(command.behaviour, StopBehaviour)
         reported = (self._stops_reported if is_stop else self._reported).take()
@@ -82,31 +91,28 @@ class CommandHandler:
         if (reason := self._check_requirements(command)) is not None:
             if reported:
                 self._on_event("warning", f"{command.text}: {reason}")
-            return {"command": command.text, "success": False, "reason": reason}
-        ended: asyncio.Future[Outcome] = asyncio.get_running_loop().create_future()
-        self._newest = max(self._newest, command.identifier)
-        self._awaited[command.identifier] = ended
+            return self._ended(identifier, command.text, Outcome(False, reason))
+        answered: asyncio.Future[dict[str, Any]] = asyncio.get_running_loop().create_future()
+        self._newest = max(self._newest, identifier)
+        self._awaited[identifier], self._open[identifier] = answered, command
+        self._publish(identifier, command.text, "accepted", None)
         self._new.append(command)
         self._on_command()
         if not reported:
-            await asyncio.wait({ended}, timeout=LASTING_S)
-            if not ended.done():  # it is active, and no newer one has superseded it
+            await asyncio.wait({answered}, timeout=LASTING_S)
+            if not answered.done():  # it is active, and no newer one has superseded it
                 reported, self._unreported = True, self._unreported - 1
                 self._report(command)
         # A cancelled caller does not stop the behaviour.
-        outcome = await asyncio.shield(ended)
-        more: dict[str, Any] = {}
-        if isinstance(command.behaviour, SequenceBehaviour):
-            outcome = command.behaviour.with_step(outcome)
-            more = {"steps": [asdict(step) for step in command.behaviour.records]}
+        reply = await asyncio.shield(answered)
+        success, text = reply["success"], f"{command.text}: {reply['reason']}"
         if reported:
-            self._on_event("info" if outcome.success else "warning", f"{command.text}: {outcome.reason}")
-        if outcome.success and command.behaviour is not None:
+            self._on_event("info" if success else "warning", text)
+        if success and command.behaviour is not None:
             self._succeeded = command
             if command.endless and not reported:  # it is active from now on
-                asyncio.get_running_loop().call_later(LASTING_S, self._report_lasting, command, outcome)
-        answer = {"success": outcome.success, "reason": outcome.reason}
-        return {"command": command.text, **answer, **more}
+                asyncio.get_running_loop().call_later(LASTING_S, self._report_lasting, command, text)
+        return reply
 
     async def _parse(self, identifier: int, text: str) -> CommandInput | Select:
         """Parse a command; one with a file in a thread, since that may take longer than the loop may wait.
@@ -140,34 +146,89 @@ class CommandHandler:
         skipped = f" ({before} before it not logged)" if before else ""
         self._on_event("info", f"command: {command.text}{skipped}")
 
-    def _report_lasting(self, command: CommandInput, outcome: Outcome) -> None:
+    def _report_lasting(self, command: CommandInput, text: str) -> None:
         """Report an endless command, unless another one has succeeded since."""
         if self._succeeded is command:
             self._unreported -= 1
             self._report(command)
-            self._on_event("info", f"{command.text}: {outcome.reason}")
+            self._on_event("info", text)
 
-    async def _select_object(self, command: Select) -> dict[str, Any]:
+    async def _select_object(self, identifier: int, command: Select) -> dict[str, Any]:
         """Guidance is not asked: the active behaviour goes on."""
         answer = await self._select(command)
         if self._reported.take():
             self._on_event("info" if answer.success else "warning", f"{command}: {answer.reason}")
         track = {"track": answer.track_id, "class": answer.class_name}
-        return {"command": str(command), "success": answer.success, "reason": answer.reason, **track}
+        return {**self._ended(identifier, str(command), Outcome(answer.success, answer.reason)), **track}
 
     def take_commands(self) -> tuple[CommandInput, ...]:
         """Return the commands received since the last call."""
         commands, self._new = tuple(self._new), []
         return commands
 
-    def on_result(self, result: CommandResult) -> None:
-        """Pass on a result from guidance."""
-        ended = self._awaited.pop(result.identifier, None)
-        if ended is not None and not ended.done():
-            ended.set_result(result.outcome)
+    def on_results(self, results: Sequence[CommandResult], endings: Sequence[CommandResult]) -> None:
+        """Pass on what guidance has answered and ended in one step."""
+        ended = {ending.identifier for ending in endings}
+        for result in results:
+            if (command := self._open.get(result.identifier)) is None:
+                continue
+            state = "ended" if result.identifier in ended else "in_progress"
+            if state == "in_progress":
+                self._publish(result.identifier, command.text, state, result.outcome)
+            awaited = self._awaited.pop(result.identifier, None)
+            if awaited is not None and not awaited.done():
+                reply = self._reply(
+                    result.identifier, command.text, state, _with_step(command, result.outcome)
+                )
+                awaited.set_result(reply | _steps(command))
+        for ending in endings:
+            if (command := self._open.pop(ending.identifier, None)) is not None:
+                self._ended(ending.identifier, command.text, _with_step(command, ending.outcome))
 
     def close(self, reason: str) -> None:
-        """Fail every command that is still pending."""
+        """End every command that has not ended."""
         self._succeeded, self._closed = None, True
-        for identifier in list(self._awaited):
-            self.on_result(CommandResult(identifier, Outcome(False, reason)))
+        outcome = Outcome(False, reason)
+        self.on_results(
+            [CommandResult(identifier, outcome) for identifier in self._awaited],
+            [CommandResult(identifier, outcome) for identifier in self._open],
+        )
+
+    def _ended(self, identifier: int, text: str, outcome: Outcome) -> dict[str, Any]:
+        """Publish the end of a command; returns its reply, if it was not answered before."""
+        self._publish(identifier, text, "ended", outcome)
+        return self._reply(identifier, text, "ended", outcome)
+
+    def _reply(self, identifier: int, text: str, state: str, outcome: Outcome) -> dict[str, Any]:
+        return {
+            "id": command_id(self._service, identifier),
+            "command": text,
+            "state": state,
+            "success": outcome.success,
+            "reason": outcome.reason,
+        }
+
+    def _publish(self, identifier: int, text: str, state: str, outcome: Outcome | None) -> None:
+        self._on_state(
+            {
+                "stamp_ns": time.monotonic_ns(),
+                "id": command_id(self._service, identifier),
+                "command": text,
+                "state": state,
+                "success": outcome.success if outcome is not None and state == "ended" else None,
+                "reason": "" if outcome is None else outcome.reason,
+            }
+        )
+
+
+def _with_step(command: CommandInput, outcome: Outcome) -> Outcome:
+    """An outcome, of a mission with the step in which it ended."""
+    behaviour = command.behaviour
+    return behaviour.with_step(outcome) if isinstance(behaviour, SequenceBehaviour) else outcome
+
+
+def _steps(command: CommandInput) -> dict[str, Any]:
+    behaviour = command.behaviour
+    if not isinstance(behaviour, SequenceBehaviour):
+        return {}
+    return {"steps": [asdict(step) for step in behaviour.records]}

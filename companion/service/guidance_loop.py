@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from companion.bus.bodies.service import CommandStateBody
 from companion.clock import Standstill
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
@@ -20,6 +21,7 @@ from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
+from companion.service.slow_updates import SlowUpdates
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
 from companion.vehicle.setpoint_loss import setpoint_loss_outcome
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -27,11 +29,6 @@ from companion.vehicle.streamer import Streamer, StreamState
 
 # Reported with the command's own result.
 _ANSWERED = (EventKind.REFUSED, EventKind.ENDED, EventKind.STARTED)
-# A longer step delays the setpoints of the 50 Hz stream: processor time, and wall-clock time (larger, because
-# other programs may have the processor).
-SLOW_STEP_NS, STALLED_STEP_NS = 5_000_000, 50_000_000
-# Minimum interval of this warning for one behaviour.
-SLOW_AGAIN_NS = 10_000_000_000
 # How long the shutdown waits for the release of resources such as gimbal control.
 RELEASE_TIMEOUT_S = 3.0
 
@@ -58,6 +55,7 @@ class GuidanceLoop:
         on_event: called with (level, text). on_step: called after every step with its time.
         others: that command the vehicle. no_vehicle: returns why no command can be flown, or None.
         record: called with time, context, input and output of every step.
+        on_command_state: called with every state of every command.
     """
 
     def __init__(
@@ -73,6 +71,7 @@ class GuidanceLoop:
         others: OtherCommanders,
         no_vehicle: Callable[[], str | None] = lambda: None,
         record: Callable[[int, StepContext, GuidanceInput, GuidanceOutput], None] = lambda *step: None,
+        on_command_state: Callable[[CommandStateBody], None] = lambda _: None,
     ) -> None:
         self.guidance, self._inputs = guidance, inputs
         self._driver, self._streamer = driver, streamer
@@ -93,9 +92,11 @@ class GuidanceLoop:
                     command, driver.state, in_command=guidance.in_command, now_ns=time.monotonic_ns()
                 )
             ),
+            on_state=on_command_state,
+            service=inputs.poses.source,
         )
         self._running = self._ending = self._seen = False
-        self._slow: tuple[str, int] = ("", 0)
+        self._slow = SlowUpdates(on_event)
 
     async def execute(self, text: str) -> dict[str, Any]:
         """Execute a command; see `Service.command`."""
@@ -189,10 +190,12 @@ class GuidanceLoop:
             ending=self._ending,
             standstill=seen.standstill,
         )
-        name = "" if self.guidance.behaviour is None else self.guidance.behaviour.name
+        before = self.guidance.behaviour
         begun_ns, used_ns = time.monotonic_ns(), time.thread_time_ns()
         output = self.guidance.step(now_ns, inputs)
-        self._warn_slow(name, time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns, now_ns)
+        used_ns, passed_ns = time.thread_time_ns() - used_ns, time.monotonic_ns() - begun_ns
+        if (behaviour := before or self.guidance.behaviour) is not None:
+            self._slow.update(behaviour.name, used_ns, passed_ns, now_ns)
         self._apply(output)
         self._driver.watch.acknowledge(seen)
         if not self._running:  # a step of the shutdown: the next one may be seconds later
@@ -209,20 +212,6 @@ class GuidanceLoop:
         self._driver.discard_received()
         self._inputs.discard_received(now_ns)
 
-    def _warn_slow(self, before: str, used_ns: int, passed_ns: int, now_ns: int) -> None:
-        """Warn of a behaviour with a slow update (`before`: the behaviour before the step, if any).
-
-        While an update blocks, nothing is sent, and the autopilot's failsafe acts.
-        """
-        name = before or ("" if self.guidance.behaviour is None else self.guidance.behaviour.name)
-        if not name or (used_ns < SLOW_STEP_NS and passed_ns < STALLED_STEP_NS):
-            return
-        last, warned_ns = self._slow
-        if name != last or now_ns - warned_ns >= SLOW_AGAIN_NS:
-            self._slow = (name, now_ns)
-            text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms elapsed"
-            self._on_event("warning", f"{name}: slow update ({text}); expected at most 5 ms")
-
     def _apply(self, output: GuidanceOutput) -> None:
         apply_output(
             output,
@@ -236,8 +225,7 @@ class GuidanceLoop:
         for event in output.events:
             if event.kind not in _ANSWERED:
                 self._on_event(event.level, event.message)
-        for result in output.results:
-            self._commands.on_result(result)
+        self._commands.on_results(output.results, output.endings)
 
     async def _wait_for_input_until(self, due_s: float) -> None:
         """Wait for new input, or until a time (CLOCK_MONOTONIC seconds)."""

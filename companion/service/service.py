@@ -112,6 +112,7 @@ class Service:
             others=self.others,
             no_vehicle=self.parts.no_vehicle,
             record=self._tap.on_step,
+            on_command_state=lambda state: self.bus.publish(topics.COMMAND_STATE, state),
         )
         self._notifier = SystemdNotifier()
         self._health = Health(
@@ -178,9 +179,9 @@ class Service:
         self._stop.set()
 
     async def command(self, text: str) -> dict[str, Any]:
-        """Execute a command; returns its result: success, reason.
+        """Execute a command; returns its result: id, success, reason.
 
-        An endless command (`hold`, `orbit` with no laps) is answered when it is in progress.
+        An endless command (`hold`) is answered when it is in progress; its end comes on `command_state`.
         """
         if not self.ready or self._ending:
             reason = "the service is shutting down" if self._ending else "the service is still starting"
@@ -228,8 +229,7 @@ class Service:
 
     def _on_calibration(self) -> None:
         sections = [camera.settings.camera for camera in self.cameras]
-        steering = self.inputs.steering.settings.camera
-        self.guidance.gimbal.mounting = gimbal_mounting(sections, steering)
+        self.guidance.gimbal.mounting = gimbal_mounting(sections, self.inputs.steering.settings.camera)
 
     def _on_result(self, camera: WorkerCamera, result: PerceptionResult) -> None:
         """Localize a camera's result, let guidance use it, then publish it."""

@@ -9,6 +9,7 @@ from typing_extensions import TypedDict
 from companion.bus.bodies import Sha256, Two, one_of
 
 LevelWord = Annotated[str, one_of("info", "warning", "error")]
+CommandStateWord = Annotated[str, one_of("accepted", "in_progress", "ended")]
 Corners = list[Two]
 
 
@@ -124,6 +125,15 @@ class StatusLimitsBody(TypedDict):
     """areas not to enter"""
 
 
+class StatusCommandBody(TypedDict):
+    """The command that the vehicle flies."""
+
+    id: str
+    """as in command_state"""
+    command: str
+    """the command as understood"""
+
+
 class StatusPilotBody(TypedDict):
     """Guidance."""
 
@@ -137,6 +147,8 @@ class StatusPilotBody(TypedDict):
     """so far"""
     mission: StatusMissionBody | None
     """null: no mission is active"""
+    command: StatusCommandBody | None
+    """the one that has begun and not ended; null: none has"""
 
 
 class StatusCameraBody(TypedDict):
@@ -308,6 +320,23 @@ class EventBody(TypedDict):
     """for the operator"""
 
 
+class CommandStateBody(TypedDict):
+    """A command has reached a state. The last message of every command has the state ended."""
+
+    stamp_ns: int
+    """when"""
+    id: str
+    """of the command: service of status, and its number there"""
+    command: str
+    """the command as understood"""
+    state: CommandStateWord
+    """accepted: given to guidance; in_progress: flown, without an end of its own; ended: also if refused"""
+    success: bool | None
+    """result; null before the end"""
+    reason: str
+    """why it has ended; empty: accepted"""
+
+
 class StepBody(TypedDict):
     """One ended step of a mission."""
 
@@ -328,6 +357,10 @@ class StepBody(TypedDict):
 class CommandReplyBody(TypedDict):
     """The reply to a command."""
 
+    id: NotRequired[str]
+    """as in command_state; missing where the command was refused before it was read"""
+    state: NotRequired[CommandStateWord]
+    """in_progress: it goes on, and command_state will have its end; ended: it does not"""
     command: str
     """the command as understood"""
     success: bool

@@ -1,11 +1,14 @@
 // Commands: the buttons, the text field, the keys, STOP, and the menu of a track. Each is a POST.
 
-import { $, ALL, browserId, button, isFleet, state } from "./state.js";
+import { Ends, outcome } from "./outcome.js";
+import { $, ALL, browserId, button, isFleet, setText, state } from "./state.js";
 
 export const HEADERS = { "Content-Type": "application/json", "X-Companion-Dashboard": "1" };
 
-const waiting = new Map(); // id of a command → what to call after its success
+const waiting = new Map(); // id of a command of this page → what to call after its success
+const ends = new Ends();
 let count = 0;
+let answered = null; // the reply that is shown; null: something else is
 
 const named = (vehicle, text) => isFleet() && vehicle !== ALL ? `${vehicle}: ${text}` : text;
 const quoted = (name) => /^[\w-]+$/.test(name) ? name : `"${name}"`;
@@ -36,17 +39,28 @@ export function onReply(answer) {
   if (!waiting.has(answer.id)) return; // of another window, or here a second time
   const then = waiting.get(answer.id);
   waiting.delete(answer.id);
-  reply(`${named(answer.vehicle, answer.command)}: ${outcome(answer)}`, answer.success ? "good" : "bad");
+  answered = answer;
+  showAnswer();
   if (then && answer.success && answer.vehicle === state.vehicle) then(answer);
 }
 
-function outcome({ success, reason }) {
-  if (success && reason.startsWith("in progress")) return `accepted, ${reason}`; // an endless command
-  return `${success ? "done" : "failed"}: ${reason}`;
+// A command has ended, of this page or of another sender.
+export function onCommandState(message) {
+  ends.add(message);
+}
+
+// Shows the reply to the last command, and once that has ended, why.
+export function showAnswer() {
+  if (!answered) return;
+  const { service } = (answered.vehicle === state.vehicle && state.topics.status) || {};
+  const [text, kind] = outcome(answered, ends, service);
+  setText($("reply"), `${named(answered.vehicle, answered.command)}: ${text}`);
+  $("reply").className = kind;
 }
 
 function reply(text, kind) {
-  $("reply").textContent = text;
+  answered = null;
+  setText($("reply"), text);
   $("reply").className = kind;
 }
 

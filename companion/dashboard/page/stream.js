@@ -2,7 +2,7 @@
 
 import { camera, endCameras } from "./cameras.js";
 import { clearChat, showChat } from "./chat.js";
-import { closeMenu, onReply } from "./commands.js";
+import { closeMenu, onCommandState, onReply, showAnswer } from "./commands.js";
 import { $, browserId, ofOneVehicle, record, showAddress, state, windowId } from "./state.js";
 
 const TRAIL_M = 0.3; // between two points of a trail
@@ -77,7 +77,9 @@ function onNews(news) {
   }
   if (news.topics.status) onStatus(news.topics.status);
   for (const event of news.events) log(event.level, event.text, (news.now_ns - event.stamp_ns) / 1e9);
+  news.command_states.forEach(onCommandState);
   news.replies.forEach(onReply);
+  showAnswer();
   if (news.chat) showChat(news.chat);
 }
 

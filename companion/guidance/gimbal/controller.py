@@ -309,10 +309,10 @@ class GimbalController:
         now_ns, state, pointing = context.now_ns, context.state, Pointing(goal)
         pitches_rad = (goal.pitch_rad,) if isinstance(goal, GimbalAim) else ()
         if missing := missing_gimbal(state, now_ns, self.snapshot(now_ns, state), pitches_rad):
-            out.result(identifier, Outcome(False, f"gimbal needs {' and '.join(missing)}"))
+            out.ended(identifier, Outcome(False, f"gimbal needs {' and '.join(missing)}"))
             return
         if (why := pointing.begin(context)) is not None:
-            out.result(identifier, Outcome(False, f"gimbal: {why}"))
+            out.ended(identifier, Outcome(False, f"gimbal: {why}"))
             return
         self._end_point(Outcome(False, "gimbal: superseded by a newer gimbal command"), out)
         self._point = _PointRequest(identifier, pointing, now_ns + POINT_TIMEOUT_S * 1e9)
@@ -387,10 +387,10 @@ class GimbalController:
             self._ending_since_ns = now_ns
 
     def _end_point(self, outcome: Outcome, out: OutputCollector) -> None:
-        if self._point is not None and self._point.answered:
-            out.event(EventKind.GIMBAL, "", outcome.reason, warning=True)
-        elif self._point is not None:
-            out.result(self._point.identifier, outcome)
+        if self._point is not None:
+            if self._point.answered:
+                out.event(EventKind.GIMBAL, "", outcome.reason, warning=True)
+            out.ended(self._point.identifier, outcome, answered=self._point.answered)
         self._point = None
 
     def problem(self, now_ns: int, state: VehicleState) -> str:
@@ -419,7 +419,7 @@ class GimbalController:
         if aim is not None and request.pointing.kept and there:
             if not request.answered:
                 text = f"gimbal kept on {request.pointing.name}, now {direction_text(aim)}"
-                out.result(request.identifier, Outcome(True, text))
+                out.in_progress(request.identifier, Outcome(True, text))
             request.answered, request.until_ns = True, now_ns + POINT_TIMEOUT_S * 1e9
         elif aim is not None and self._control.pointed == aim and there:
             self._end_point(Outcome(True, f"gimbal points {direction_text(aim)}"), out)

@@ -79,6 +79,7 @@ def test_example_bodies_in_the_document_are_valid() -> None:
         "camera_info",
         "transforms",
         "velocity",
+        "command_state",
     }
 
 

@@ -67,7 +67,13 @@ class Vehicle:
             self._stopped.clear()
             await self._stopped.wait()
             return {"command": text, "success": False, "reason": "replaced by stop"}
-        return {"command": text, "success": text.split()[0] not in self.refused, "reason": "refused 7"}
+        success = text.split()[0] not in self.refused
+        return {"id": f"a-{len(self.commands)}", "command": text, "success": success, "reason": "refused 7"}
+
+    def end(self, number: int, reason: str) -> None:
+        """Publish the end of a command."""
+        body = {"id": f"a-{number}", "command": "c", "state": "ended", "success": False, "reason": reason}
+        self.bus.publish(topics.COMMAND_STATE, body)
 
 
 @asynccontextmanager
@@ -305,21 +311,47 @@ async def test_steering_sends_velocities_and_ends_with_zero() -> None:
 async def test_steering_raises_once_something_else_is_flown() -> None:
     async with connected() as (there, drone):
         async with drone.steer() as steering:
-            states, own = drone.status(size=10), f"velocity of {steering.source}"
-            await drone.takeoff(3)  # its answer comes after the subscriptions have arrived
-            for behaviour in ("hold", own):  # the first is from before the command
-                there.bus.publish(topics.STATUS, {"pilot": {"behaviour": behaviour}})
-            async with asyncio.timeout(20.0):
-                while (await anext(states))["pilot"]["behaviour"] != own:
-                    pass
             steering.send(forward=1.0)
-            there.bus.publish(topics.STATUS, {"pilot": {"behaviour": "velocity of b-2"}})
-            with pytest.raises(CommandFailedError, match="velocity of b-2") as failed:
+            there.end(1, "replaced by orbit")
+            with pytest.raises(CommandFailedError, match="replaced by orbit") as failed:
                 await until(lambda: steering.send(forward=2.0))
-            assert failed.value.reply["command"] == f"velocity source={steering.source}"
+            assert failed.value.reply["id"] == "a-1"
         # The last velocity is not flown on by the next steering: zero replaces it.
         await until(lambda: there.velocities[-1]["forward_mps"] == 0.0)
         assert there.velocities[0]["forward_mps"] == 1.0
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("late", [False, True])
+async def test_end_of_an_endless_command_has_its_reason(late: bool) -> None:
+    """Also one that comes before it is waited for, with more messages after it than are kept."""
+    async with connected() as (there, drone):
+        reply, other = await drone.takeoff(3), await drone.takeoff(4)
+        if not late:
+            waiting = asyncio.create_task(drone.ended(reply))
+            await asyncio.sleep(0)
+        there.end(1, "the pilot took over")
+        for number in range(3, 3 + topics.COMMAND_STATE.cached if late else 3):
+            there.end(number, "refused")
+            await asyncio.sleep(0.002)
+        there.end(2, "replaced by hold")
+        assert (await asyncio.wait_for(drone.ended(other), 20.0))["reason"] == "replaced by hold"
+        ended = await asyncio.wait_for(drone.ended(reply) if late else waiting, 20.0)
+        assert (ended["id"], ended["reason"]) == ("a-1", "the pilot took over")
+
+
+@pytest.mark.realtime
+async def test_waiting_for_an_end_fails_with_the_service() -> None:
+    async with connected() as (there, drone):
+        reply = await drone.takeoff(3)
+        waiting = [asyncio.create_task(drone.ended(reply)) for _ in range(2)]
+        await asyncio.sleep(0)
+        await there.bus.close()
+        for task in waiting:
+            with pytest.raises(NoAnswerError):
+                await asyncio.wait_for(task, 20.0)
+        with pytest.raises(NoAnswerError):
+            await asyncio.wait_for(drone.ended(reply), 20.0)
 
 
 @pytest.mark.realtime

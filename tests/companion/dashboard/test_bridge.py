@@ -261,7 +261,7 @@ async def test_command_and_its_outcome() -> None:
             assert query.payload is not None
             text = query.payload.to_string()
             with query:
-                reply = {"success": text == "land", "reason": f"got {text}", "track": 17}
+                reply = {"id": "s-3", "success": text == "land", "reason": f"got {text}", "track": 17}
                 query.reply(query.key_expr, json.dumps(reply))
 
         service.session.declare_queryable(command_key(NAME), answer)
@@ -270,7 +270,7 @@ async def test_command_and_its_outcome() -> None:
             for text, success in (("land", True), ("follow track=17", False)):
                 outcome = fleet.command(NAME, text, "id1")
                 assert outcome is not None
-                reply = {"success": success, "reason": f"got {text}", "track": 17}
+                reply = {"command_id": "s-3", "success": success, "reason": f"got {text}", "track": 17}
                 wanted = {"id": "id1", "command": text, "vehicle": NAME, **reply}
                 assert await asyncio.wait_for(outcome, 20) == wanted
                 assert fleet.replies(0)[1][-1] == wanted

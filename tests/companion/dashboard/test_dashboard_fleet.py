@@ -153,8 +153,12 @@ async def test_number_of_kept_vehicles_is_limited() -> None:
                 assert fleet.bridge("other4") is kept[4]
 
 
-def answering(services: dict[str, Publisher]) -> list[tuple[str, str]]:
-    """Answer the commands of all; returns the list of (vehicle, text) that is filled."""
+def answering(services: dict[str, Publisher], **more: Any) -> list[tuple[str, str]]:
+    """Answer the commands of all; returns the list of (vehicle, text) that is filled.
+
+    Args:
+        more: fields of the replies.
+    """
     received: list[tuple[str, str]] = []
 
     def declare(name: str) -> None:
@@ -162,7 +166,7 @@ def answering(services: dict[str, Publisher]) -> list[tuple[str, str]]:
             assert query.payload is not None
             received.append((name, query.payload.to_string()))
             with query:
-                query.reply(query.key_expr, json.dumps({"success": True, "reason": "holding"}))
+                query.reply(query.key_expr, json.dumps({"success": True, "reason": "holding", **more}))
 
         services[name].session.declare_queryable(command_key(name), answer)
 

@@ -20,7 +20,7 @@ import pytest
 import zenoh
 
 from companion.bus.client import listen
-from companion.bus.topics import DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
+from companion.bus.topics import COMMAND_STATE, DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
 from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
@@ -397,6 +397,22 @@ def test_page_shows_a_silent_service_and_the_age_of_its_state(window: Tab) -> No
 
             wait_for(shown)
         tab.until(f"/Shown is its state of [0-9]+ s ago/.test({LINK})")
+
+
+def test_page_says_how_an_endless_command_has_ended(window: Tab) -> None:
+    with publishing() as (service, endpoint), dashboard_here(endpoint) as url, page_at(window, url) as tab:
+        answering({NAME: service}, id="s-1", state="in_progress", reason="in progress")
+        tab.until("state.at > 0 && state.alive")
+        tab.value("document.querySelector('[data-command=hold]').click()")
+        tab.until(f"{REPLY} === 'hold: accepted, in progress'")
+        kind = "document.querySelector('#reply').className"
+        assert tab.value(kind) == "good"
+        reason = "the pilot took over: position mode"
+        ended = {"id": "s-1", "state": "ended", "success": False, "reason": reason}
+        service.publish(COMMAND_STATE.key(NAME), {**ended, "id": "s-2"})
+        service.publish(COMMAND_STATE.key(NAME), ended)
+        tab.until(f"{REPLY} === 'hold: ended: {reason}'")
+        assert tab.value(kind) == "ended"
 
 
 # Pixels of the fence's colour in the map.

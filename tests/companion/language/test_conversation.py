@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bus.bodies.service import CommandStateBody
 from companion.guidance.grammar import json_schema, parse
 from companion.language.control import CommandEvents, Control
 from companion.language.conversation import MAX_TURNS, Conversation, Operator, plan_of
@@ -34,6 +35,10 @@ class FakeVehicle:
         self.commands: list[str] = []
         self.seen, self._refused = scene, refused
         self.controlled = Control()
+        self.ended: CommandStateBody | None = None
+
+    def ending(self, reply: dict[str, Any]) -> CommandStateBody | None:
+        return self.ended
 
     async def command(self, text: str) -> dict[str, Any]:
         self.commands.append(text)

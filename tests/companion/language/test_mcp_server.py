@@ -125,6 +125,21 @@ async def test_command_that_is_not_allowed_names_the_flag(word: str) -> None:
         assert (await caller.call("why_not"))[1]["newest_command"] == reply["reason"]
 
 
+async def test_why_not_says_how_an_endless_command_has_ended() -> None:
+    async with calling("orbit") as caller:
+        reply = (await caller.call("orbit"))[1]
+        assert (await caller.call("why_not"))[1]["newest_command"] == reply["reason"]
+        caller.vehicle.ended = {
+            "stamp_ns": 1,
+            "id": "s-1",
+            "command": "orbit",
+            "state": "ended",
+            "success": False,
+            "reason": "the pilot took over",
+        }
+        assert (await caller.call("why_not"))[1]["newest_command"] == "the pilot took over"
+
+
 async def test_allowed_command_is_flown_with_the_service_s_reply() -> None:
     async with calling("takeoff") as caller:
         assert await caller.call("takeoff", altitude=5) == (

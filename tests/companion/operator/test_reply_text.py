@@ -22,4 +22,5 @@ from companion.operator.reply_text import reply_text
     ],
 )
 def test_reply_says_result_and_takeover(success: bool, reason: str, text: str) -> None:
-    assert reply_text({"success": success, "reason": reason}) == text
+    state = "in_progress" if text.startswith("accepted") else "ended"
+    assert reply_text({"state": state, "success": success, "reason": reason}) == text

@@ -9,11 +9,13 @@ from typing import Any
 
 import pytest
 
+from companion.bus.bodies.service import CommandStateBody
 from companion.bus.command_intake import Allowance
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.select import Select
 from companion.guidance.behaviours.stop import StopBehaviour
+from companion.guidance.command import GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.service import command_handler
 from companion.service.command_handler import REPORTED_AT_ONCE, REPORTED_PER_S, CommandHandler
@@ -27,10 +29,15 @@ async def no_selection(_request: object) -> Selected:
 
 
 class Handler(CommandHandler):
-    """A handler that refuses `goto`, at a clock that stands still. `lines`: the texts of its events."""
+    """A handler that refuses `goto`, at a clock that stands still.
+
+    Attributes:
+        lines: the texts of its events. states: of its commands.
+    """
 
     def __init__(self) -> None:
         self.lines: list[str] = []
+        self.states: list[CommandStateBody] = []
         super().__init__(
             lambda identifier, text: CommandInput(
                 identifier,
@@ -42,10 +49,17 @@ class Handler(CommandHandler):
             lambda: None,
             lambda _level, text: self.lines.append(text),
             check_requirements=lambda command: "refused 7" if "goto" in command.text else None,
+            on_state=self.states.append,
+            service="s",
         )
         self._reported, self._stops_reported = (
             Allowance(REPORTED_PER_S, REPORTED_AT_ONCE, lambda: 0.0) for _ in range(2)
         )
+
+    def answer(self, identifier: int, outcome: Outcome, *, ended: bool = True) -> None:
+        """Answer a command as guidance does. `ended`: else it is in progress."""
+        result = CommandResult(identifier, outcome)
+        self.on_results([result], [result] if ended else [])
 
     async def until_started(self, text: str) -> tuple[int, asyncio.Task[dict[str, Any]]]:
         """Execute a command; returns when guidance can take it, with its identifier."""
@@ -77,16 +91,15 @@ async def test_validity_counts_from_the_reception_of_the_command() -> None:
         read_ns.append(time.monotonic_ns())
         return CommandInput(identifier, text, HoldBehaviour())
 
-    handler = CommandHandler(
-        read, no_selection, lambda: None, lambda *event: None, check_requirements=lambda command: None
-    )
+    handler = Handler()
+    handler._read = read
     given_ns = time.monotonic_ns()
     answer = asyncio.create_task(handler.execute("mission demo"))
     while not (commands := handler.take_commands()):
         await asyncio.sleep(0)
     assert commands[0].received_ns is not None
     assert given_ns <= commands[0].received_ns <= read_ns[0] - 10_000_000
-    handler.on_result(CommandResult(commands[0].identifier, Outcome(True, "done")))
+    handler.answer(commands[0].identifier, Outcome(True, "done"))
     await answer
 
 
@@ -101,11 +114,11 @@ async def test_command_flown_in_a_flood_is_logged(monkeypatch: pytest.MonkeyPatc
     before = len(handler.lines)
     short, superseded = await handler.until_started("hold")
     long, flown = await handler.until_started("orbit")
-    handler.on_result(CommandResult(short, Outcome(False, "superseded by orbit")))
+    handler.answer(short, Outcome(False, "superseded by orbit"))
     assert not (await superseded)["success"]
     while len(handler.lines) == before:
         await asyncio.sleep(0.005)
-    handler.on_result(CommandResult(long, Outcome(True, "flown")))
+    handler.answer(long, Outcome(True, "flown"))
     assert (await flown)["success"]
     assert handler.lines[before:] == [line_after_flood("orbit"), "orbit: flown"]
 
@@ -117,7 +130,7 @@ async def test_endless_command_flown_in_a_flood_is_logged(monkeypatch: pytest.Mo
     before = len(handler.lines)
     for text in ("orbit radius=6", "orbit radius=7"):
         identifier, answer = await handler.until_started(text)
-        handler.on_result(CommandResult(identifier, Outcome(True, "in progress")))
+        handler.answer(identifier, Outcome(True, "in progress"), ended=False)
         assert (await answer)["success"]
     while len(handler.lines) == before:
         await asyncio.sleep(0.005)
@@ -129,7 +142,7 @@ async def test_stop_in_a_flood_is_logged_at_once() -> None:
     before = len(handler.lines)
     identifier, answer = await handler.until_started("stop")
     assert handler.lines[before].startswith("command: stop")
-    handler.on_result(CommandResult(identifier, Outcome(True, "holding")))
+    handler.answer(identifier, Outcome(True, "holding"))
     assert (await answer)["success"]
     assert handler.lines[before + 1 :] == ["stop: holding"]
 
@@ -162,12 +175,12 @@ async def test_mission_is_read_outside_the_loop_and_a_stop_wins() -> None:
     handler.release.set()
     assert not (await mission)["success"]
     assert handler.take_commands() == ()  # the mission is not flown after the stop
-    handler.on_result(CommandResult(stop, Outcome(True, "stopped")))
+    handler.answer(stop, Outcome(True, "stopped"))
     assert (await stopping)["success"]
     assert handler.threads["stop"] == threading.main_thread().name
     assert handler.threads["mission"] != threading.main_thread().name
     identifier, flying = await handler.until_started("mission far")
-    handler.on_result(CommandResult(identifier, Outcome(True, "done")))
+    handler.answer(identifier, Outcome(True, "done"))
     assert (await flying)["success"]
 
 
@@ -190,3 +203,42 @@ async def test_mission_that_is_read_across_a_suspend_is_not_flown(monkeypatch: p
     handler.release.set()
     assert not (await mission)["success"]
     assert handler.take_commands() == ()
+
+
+def told(handler: Handler) -> list[tuple[str, str, bool | None, str]]:
+    return [(one["id"], one["state"], one["success"], one["reason"]) for one in handler.states]
+
+
+async def test_every_command_has_one_last_state_with_its_reason() -> None:
+    handler = Handler()
+    refused = await handler.execute("goto 1 0")
+    first, flown = await handler.until_started("orbit")
+    handler.answer(first, Outcome(True, "in progress"), ended=False)
+    second, _ = await handler.until_started("hold")
+    handler.on_results([], [CommandResult(first, Outcome(False, "replaced by hold"))])
+    handler.close("the service ends")
+    assert told(handler) == [
+        (refused["id"], "ended", False, "refused 7"),
+        ((await flown)["id"], "accepted", None, ""),
+        (f"s-{first}", "in_progress", None, "in progress"),
+        (f"s-{second}", "accepted", None, ""),
+        (f"s-{first}", "ended", False, "replaced by hold"),
+        (f"s-{second}", "ended", False, "the service ends"),
+    ]
+
+
+async def test_unreadable_command_and_selection_end_too() -> None:
+    handler = Handler()
+
+    def read(_identifier: int, text: str) -> CommandInput | Select:
+        if text == "select":
+            return Select()
+        raise GrammarError("unknown 9")
+
+    async def selected(_request: object) -> Selected:
+        return Selected(True, "following it", 4, "car")
+
+    handler._read, handler._select = read, selected
+    assert (await handler.execute("dance"))["id"] == "s-1"
+    assert (await handler.execute("select"))["track"] == 4
+    assert told(handler) == [("s-1", "ended", False, "unknown 9"), ("s-2", "ended", True, "following it")]

@@ -148,6 +148,7 @@ class LoopHarness:
             step_context=lambda mounting: None,
             steering=SimpleNamespace(request_path=None),
             select=None,
+            poses=SimpleNamespace(source="s"),
         )
 
     @asynccontextmanager

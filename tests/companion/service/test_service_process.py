@@ -54,7 +54,8 @@ def wait_for_truth(path: Path, condition: Any, timeout_s: float = 30.0) -> dict[
 def fly(service: ServiceProcess) -> None:
     """Take off and enter OFFBOARD."""
     service.take_off(2.5)
-    assert service.command("hold") == {"command": "hold", "success": True, "reason": "in progress"}
+    reply = service.command("hold")
+    assert (reply["state"], reply["success"], reply["reason"]) == ("in_progress", True, "in progress")
 
 
 def test_ardupilot_is_recognized_by_a_service_without_a_camera(tmp_path: Path) -> None:
