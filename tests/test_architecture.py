@@ -23,6 +23,7 @@ COMPANION_LAYERS = {
     "plugins": 0,
     "restarts": 0,
     "scheduling": 0,
+    "load": 0,
     "tasks": 0,
     "toml_text": 0,
     "settings": 1,

@@ -38,7 +38,7 @@ def status_message(
     now_ns: int,
     *,
     uptime_s: float,
-    healthy: bool,
+    unhealthy: list[str],
     parts: list[PartBody],
     driver: Driver,
     guidance: Guidance,
@@ -63,7 +63,8 @@ def status_message(
         "stamp_ns": now_ns,
         "service": poses.source,
         "uptime_s": round(uptime_s, 1),
-        "healthy": healthy,
+        "healthy": not unhealthy,
+        "unhealthy": unhealthy,
         "parts": parts,
         "vehicle": {
             "name": poses.vehicle,

@@ -23,6 +23,7 @@ from companion.guidance.targets.from_detections import (
 from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
+from companion.load import busy_text
 from companion.perception.messages import AnyPreview
 from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
@@ -108,15 +109,19 @@ class PerceptionCamera:
             return ""
         return f"camera frozen: the same {self._repeated} for {age_s:.1f} s"
 
-    def seeing(self, now_ns: int) -> bool:
-        """Whether results arrive as expected, or none are expected."""
+    def blind(self, now_ns: int) -> str:
+        """Why results do not arrive as expected, in words; empty: they do, or none are expected."""
         if not self.settings.detector.enabled:
-            return True
+            return ""
         age_s = self.age_s(now_ns)
+        if age_s is None:
+            return "no result yet"
         allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
         # Just before the next result the newest is as old as its own latency and one interval.
         usual_s = statistics.median(self._between_s) if self._between_s else 0.0
-        return age_s is not None and age_s <= allowed_s + 2 * usual_s
+        if age_s <= allowed_s + 2 * usual_s:
+            return ""
+        return self.frozen(now_ns) or f"no result for {age_s:.1f} s"
 
     def ranging(self, pitch_rad: float) -> RangeMeans:
         """Return the available means of range estimation; all of them before the first result.
@@ -228,12 +233,12 @@ class WorkerCamera(PerceptionCamera):
     def class_names(self) -> tuple[str, ...] | None:
         return self.supervisor.class_names or None
 
-    def seeing(self, now_ns: int) -> bool:
-        return (
-            self.settings.source.uri == NO_SOURCE
-            or self.supervisor.state is PerceptionState.FINISHED
-            or super().seeing(now_ns)
-        )
+    def blind(self, now_ns: int) -> str:
+        if self.settings.source.uri == NO_SOURCE or self.supervisor.state is PerceptionState.FINISHED:
+            return ""
+        if not (why := super().blind(now_ns)):
+            return ""
+        return f"{why}; {self.supervisor.problem}" if self.supervisor.problem else f"{why}{busy_text()}"
 
     async def start(self) -> None:
         """Start the worker, as `PerceptionSupervisor.start`; the error has the camera's name."""

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from companion.load import busy_text
 from companion.perception.messages import (
     AnyPreview,
     Attitude,
@@ -278,7 +279,7 @@ class PerceptionSupervisor:
 
     @property
     def problem(self) -> str:
-        """The last error; empty: none."""
+        """Why no worker runs: the last error; empty: one runs."""
         return self._problem
 
     @property
@@ -457,10 +458,8 @@ class PerceptionSupervisor:
             # After the stop request it sends no messages, and `stop` has its own timeouts.
             elif not self._stop_asked.is_set() and watchdog.silent_s(now_s) > watchdog.stuck_after_s:
                 assert self._process is not None
-                text = (
-                    f"process {self._process.pid} is stuck: no message for {watchdog.silent_s(now_s):.1f} s"
-                )
-                return _End(False, text)
+                text = f"process {self._process.pid} is stuck: no message for"
+                return _End(False, f"{text} {watchdog.silent_s(now_s):.1f} s{busy_text()}")
 
     async def _read(
         self, process: PerceptionProcess, watchdog: Watchdog, started: asyncio.Future[None]
@@ -497,7 +496,7 @@ class PerceptionSupervisor:
 
     def _on_ready(self, ready: Ready, process: PerceptionProcess) -> None:
         self._ready = ready
-        self._state = PerceptionState.RUNNING
+        self._state, self._problem = PerceptionState.RUNNING, ""
         self._ready_s = time.monotonic()
         self._on_calibration(ready.calibration)
         self.send_hud(self._hud.lines, self._hud.highlight)

@@ -61,10 +61,16 @@ class Health:
             self._inputs.parameters, sticks_present=self._driver.state.sticks_present
         )
 
-    def healthy(self, now_ns: int) -> bool:
-        """Whether every camera delivers results, and the autopilot, if one is expected, is connected."""
-        linked = not self._has_vehicle or self._driver.state.connected(now_ns)
-        return linked and all(camera.seeing(now_ns) for camera in self._cameras)
+    def unhealthy(self, now_ns: int) -> list[str]:
+        """Which camera delivers no results, and whether an expected autopilot is missing, with reasons."""
+        state, reasons = self._driver.state, list[str]()
+        if self._has_vehicle and not state.connected(now_ns):
+            silent = f"for {(now_ns - state.heartbeat_ns) / 1e9:.0f} s" if state.heartbeat_ns else "yet"
+            reasons.append(f"autopilot: no heartbeat {silent}")
+        for camera in self._cameras:
+            if why := camera.blind(now_ns):
+                reasons.append(f"{'camera' if camera.name is None else f'camera {camera.name}'}: {why}")
+        return reasons
 
     async def run(self) -> None:
         """Run `check` whenever the link has opened or returned, or the autopilot has restarted."""
@@ -149,7 +155,7 @@ class Health:
         if shared and not guidance.in_command:
             self._driver.change_address()
         self._driver.send_heartbeat(
-            SystemStatus.ACTIVE if self.healthy(now_ns) else SystemStatus.CRITICAL,
+            SystemStatus.CRITICAL if self.unhealthy(now_ns) else SystemStatus.ACTIVE,
             uptime_s=self._others.uptime_s(now_ns),
             in_command=guidance.in_command,
         )

@@ -194,7 +194,7 @@ class Service:
         return status_message(
             now_ns,
             uptime_s=self.others.uptime_s(now_ns),
-            healthy=self._health.healthy(now_ns),
+            unhealthy=self._health.unhealthy(now_ns),
             parts=self.parts.bodies(now_ns),
             driver=self.driver,
             guidance=self.guidance,

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from companion.load import busy_text
+
 # A longer step delays the setpoints of the 50 Hz stream: processor time, and wall-clock time (larger, because
 # other programs may have the processor).
 SLOW_STEP_NS, STALLED_STEP_NS = 5_000_000, 50_000_000
@@ -33,4 +35,6 @@ class SlowUpdates:
         if behaviour != last or now_ns - warned_ns >= SLOW_AGAIN_NS:
             self._newest = (behaviour, now_ns)
             text = f"{used_ns / 1e6:.0f} ms of processor time, {passed_ns / 1e6:.0f} ms elapsed"
-            self._on_event("warning", f"{behaviour}: slow update ({text}); expected at most 5 ms")
+            # Its own processor time is not the fault of others.
+            why = busy_text() if used_ns < SLOW_STEP_NS else ""
+            self._on_event("warning", f"{behaviour}: slow update ({text}); expected at most 5 ms{why}")

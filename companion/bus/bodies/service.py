@@ -199,7 +199,7 @@ class StatusCameraBody(TypedDict):
     runtime_reason: str
     """why this runtime and precision"""
     problem: str
-    """the last error; empty: none"""
+    """why it does not run: the last error; empty: it runs"""
 
 
 class StatusTargetsBody(TypedDict):
@@ -285,6 +285,8 @@ class StatusBody(TypedDict):
     """since the start of the service"""
     healthy: bool
     """every camera delivers results, and the autopilot, if there is to be one, is connected"""
+    unhealthy: list[str]
+    """why it is not healthy; empty: it is"""
     parts: list[PartBody]
     """what comes from outside; without an autopilot in it there is no vehicle (vehicle.url is none)"""
     vehicle: StatusVehicleBody

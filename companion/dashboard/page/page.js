@@ -64,7 +64,8 @@ function linkText() {
   const parts = status.parts || []; // an older service has none
   const waiting = parts.filter((part) => !["ready", "finished"].includes(part.state));
   if (waiting.length) return [`Waiting for ${waiting.map((part) => partText(part, status.stamp_ns)).join(" · ")}`, true];
-  const health = status.healthy ? "healthy" : "not healthy";
+  const reasons = status.unhealthy || []; // an older service has none
+  const health = status.healthy ? "healthy" : `not healthy${reasons.length ? `: ${reasons.join(" · ")}` : ""}`;
   const hasVehicle = !status.parts || parts.some((part) => part.name === "autopilot");
   return [`${hasVehicle ? status.vehicle.autopilot || "autopilot" : "no vehicle"} · ${health}`, !status.healthy];
 }

@@ -246,17 +246,20 @@ async def test_killed_worker_is_replaced_and_sequence_continues(photos: Path, tm
         assert len(list(source)) >= 3
 
 
-async def test_stopped_worker_is_stuck_and_replaced(photos: Path) -> None:
+async def test_stopped_worker_is_stuck_and_replaced(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async with supervised(settings_of(photos)) as (supervisor, recorder):
         await until(lambda: len(recorder.results) >= 3)
         pid = supervisor.status.pid
         assert pid is not None
+        monkeypatch.setattr("os.getloadavg", lambda: (987.0, 0.0, 0.0))
         os.kill(pid, signal.SIGSTOP)
-        await until(lambda: recorder.has_event(f"process {pid} is stuck"))
+        await until(lambda: recorder.has_event(f"process {pid} is stuck", "load 987"))
         assert not alive(pid)
         before = len(recorder.results)
+        assert "is stuck" in supervisor.status.problem
         await until(lambda: len(recorder.results) > before)
         assert supervisor.status.state is PerceptionState.RUNNING
+        assert supervisor.status.problem == ""
 
 
 async def test_incomplete_video_is_reported_at_stop(

@@ -87,7 +87,7 @@ def test_a_frozen_camera_ages_from_the_first_image() -> None:
     assert "camera frozen" in seen[-1].camera_fault
     assert not seen[-1].targets
     assert bench.camera.age_s(bench.now_ns) == pytest.approx(1.98)
-    assert not bench.camera.seeing(bench.now_ns + 10**9)
+    assert bench.camera.blind(bench.now_ns + 10**9)
     assert [level for level, _ in bench.events] == ["warning"]
 
 

@@ -20,7 +20,7 @@ from companion.service.other_commanders import FOREIGN_OFFBOARD, OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion
-from companion.vehicle.driver import CommandRefusedError, Driver
+from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VtolState
 
@@ -278,3 +278,40 @@ async def test_offboard_counts_as_anothers_by_the_parameters(lost: float, counts
 
 async def test_unknown_autopilot_is_asked_for_no_parameter() -> None:
     assert (await check(None, {}, None))[1] == []
+
+
+class Watched(PerceptionCamera):
+    """A camera that is blind for a reason."""
+
+    def __init__(self, name: str | None, why: str) -> None:
+        super().__init__(plain_settings(), name)
+        self._why = why
+
+    def blind(self, now_ns: int) -> str:
+        return self._why
+
+
+@pytest.mark.parametrize(
+    ("heartbeat_ns", "cameras", "reasons"),
+    [
+        (1, {None: ""}, []),
+        (0, {None: ""}, ["autopilot: no heartbeat yet"]),
+        (1 - 4 * 10**9, {None: ""}, ["autopilot: no heartbeat for 4 s"]),
+        (1, {None: "no result yet", "down": ""}, ["camera: no result yet"]),
+        (-9 * 10**9, {None: "", "down": "gone"}, ["autopilot: no heartbeat for 9 s", "camera down: gone"]),
+    ],
+)
+def test_unhealthy_has_its_reasons_and_so_has_the_heartbeat(
+    heartbeat_ns: int, cameras: dict[str | None, str], reasons: list[str]
+) -> None:
+    driver = FakeDriver("PX4", {}, None)
+    driver.state = VehicleState(heartbeat_ns=heartbeat_ns)
+    sent: list[SystemStatus] = []
+    driver.send_heartbeat = lambda status, **_: sent.append(status)  # type: ignore[method-assign]
+    seen = [Watched(name, why) for name, why in cameras.items()]
+    inputs = InputAssembler(plain_settings(), [PerceptionCamera(plain_settings())], lambda *_: None)
+    others = OtherCommanders(VehicleSection(), "s", 0, lambda *_: None)
+    health = Health(cast(Driver, driver), inputs, cast(Any, seen), SystemdNotifier(), others, lambda *_: None)
+    assert health.unhealthy(1) == reasons
+    health._send_heartbeat(1, Guidance())
+    assert sent == [SystemStatus.CRITICAL if reasons else SystemStatus.ACTIVE]
