@@ -53,7 +53,7 @@ export function onCommandState(message) {
 export function showAnswer() {
   if (!answered) return;
   const { service } = (answered.vehicle === state.vehicle && state.topics.status) || {};
-  const [text, kind] = outcome(answered, ends, service);
+  const [text, kind] = outcome(answered, ends, service, !!state.outage);
   setText($("reply"), `${named(answered.vehicle, answered.command)}: ${text}`);
   $("reply").className = kind;
 }

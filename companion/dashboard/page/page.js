@@ -1,8 +1,9 @@
 // The page of one vehicle of those on the bus. This module draws the state, ten times a second.
 
 import { drawAttitude, drawChart } from "./charts.js";
-import { openMenu } from "./commands.js";
+import { openMenu, showAnswer } from "./commands.js";
 import { drawMap } from "./map.js";
+import { outage } from "./outage.js";
 import "./steer.js";
 import {
   $, age, button, cameras, heading, isFleet, measureClock, number, setText, STALE_S, state,
@@ -11,7 +12,6 @@ import { cameraOf, connect, disconnect, select } from "./stream.js";
 
 const RENDER_PERIOD_MS = 100;
 const CLOCK_PERIOD_MS = 30000;
-const STATUS_STALE_S = 4;
 const DETECTIONS_SHOWN_S = 2;
 
 function render() {
@@ -19,6 +19,7 @@ function render() {
   const status = state.topics.status || {};
   const pilot = status.pilot || {};
   renderFleet();
+  renderOutage(vehicle, status);
   renderSummary(vehicle);
   setText($("behaviour"), pilot.behaviour ? `Service: ${pilot.behaviour}` : "");
   renderMission(pilot);
@@ -31,6 +32,30 @@ function render() {
   drawChart($("latency"), "Latency", $("latency-now"), state.latency, latencies, "ms");
   const losses = { dropped: "dropped", skipped: "skipped by setting" };
   drawChart($("drops"), "Frames lost", $("drops-now"), state.drops, losses, "/s");
+}
+
+// Without a service nothing here is true any more, and no command but STOP is sent.
+const COMMANDING = "#commands button, #talking button, #menu button, #detections button";
+
+function renderOutage(vehicle, status) {
+  const { problem, alive } = state;
+  const silentS = (performance.now() - state.at) / 1000;
+  const oldS = state.at ? age("status") ?? age("vehicle") : null;
+  state.outage = outage({ silentS, problem, alive, oldS, status, vehicle });
+  const { what = "", vehicle: now = "", todo = "" } = state.outage || {};
+  $("outage").hidden = $("off").hidden = !state.outage;
+  // Read aloud once, not with each second.
+  for (const [name, text] of Object.entries({ what: what.split(/[;.] /)[0], vehicle: now, todo })) {
+    setText($("outage").querySelector(`.${name}`), text);
+  }
+  setText($("off"), state.outage ? "No commands: the service does not answer. STOP is sent all the same." : "");
+  document.body.classList.toggle("stale", !!state.outage);
+  for (const item of document.querySelectorAll(COMMANDING)) {
+    if (item.disabled === !!state.outage) continue;
+    item.disabled = !!state.outage;
+    item.title = state.outage ? $("off").textContent : "";
+  }
+  showAnswer();
 }
 
 function renderSummary({ mode, armed, altitude_m: altitude, velocity_ned_mps: v, battery_fraction: battery }) {
@@ -50,15 +75,11 @@ function linkText() {
   if (state.replaced) return ["Paused: this page is open in too many windows. Reload to continue here.", true];
   if (state.refused) return [state.refused, true];
   if (!state.at) return ["connecting to the dashboard", false];
-  if (silentS > STALE_S) {
-    return [`The dashboard does not answer; everything here is ${silentS.toFixed(0)} s old.`, true];
-  }
-  const old = age("status") ?? age("vehicle");
-  const since = old == null ? "" : ` Shown is its state of ${old.toFixed(0)} s ago.`;
-  if (state.problem) return [`${state.problem}${since}`, true];
-  if (state.alive === false) return [old == null ? "No service answers." : `The service is gone.${since}`, true];
-  if (old == null) return ["waiting for the service", false];
-  if (old > STATUS_STALE_S) return [`Stale: the last state came ${old.toFixed(0)} s ago.`, true];
+  if (state.outage) return [state.outage.what, true];
+  if (silentS > STALE_S) return [`The dashboard has not answered for ${silentS.toFixed(0)} s.`, true];
+  if (state.problem) return [state.problem, true];
+  if (state.alive === false) return ["No service answers.", true];
+  if ((age("status") ?? age("vehicle")) == null) return ["waiting for the service", false];
   const { vehicle, status } = state.topics;
   if (!status) return vehicle && vehicle.connected === false ? ["No autopilot heartbeat.", true] : ["", false];
   const parts = status.parts || []; // an older service has none

@@ -1,7 +1,7 @@
 // What the page knows, and small functions that all its modules use.
 
 export const ALL = "*"; // as the vehicle of a stop
-export const STALE_S = 3;
+export { STALE_S } from "./outage.js";
 export const HISTORY_S = 60; // of the charts
 
 const address = new URLSearchParams(location.search);
@@ -11,6 +11,7 @@ export const state = {
   problem: "connecting to the dashboard",
   refused: "",
   alive: null,
+  outage: null, // why nothing here is true any more (outage.js)
   replaced: false, // the browser has too many windows of this page
   stream: null,
   maxImages: 0, // in flight

@@ -15,7 +15,7 @@ SHOWN = """
 (() => {
   const ends = new module.Ends();
   for (const message of given.messages) ends.add(message);
-  return module.outcome(given.reply, ends, given.service);
+  return module.outcome(given.reply, ends, given.service, given.stale);
 })()
 """
 
@@ -42,6 +42,14 @@ def test_reply_is_shown_until_the_command_has_ended() -> None:
         assert shown(FLOWN, end(reason)) == [f"ended: {reason}", "ended"]
     text, kind = shown(FLOWN, service="other")
     assert (text.partition(":")[0], kind) == ("ended", "ended")
+
+
+def test_command_of_a_silent_service_is_not_shown_as_accepted() -> None:
+    given = {"reply": FLOWN, "messages": [], "service": "s", "stale": True}
+    text, kind = evaluate("outcome.js", SHOWN, given)
+    assert ("accepted" in text, kind) == (False, "waiting")
+    given["messages"] = [end("replaced by hold")]
+    assert evaluate("outcome.js", SHOWN, given) == ["ended: replaced by hold", "ended"]
 
 
 def test_reply_to_a_command_that_has_ended_is_its_end() -> None:

@@ -397,6 +397,17 @@ def test_page_shows_a_silent_service_and_the_age_of_its_state(window: Tab) -> No
 
             wait_for(shown)
         tab.until(f"/Shown is its state of [0-9]+ s ago/.test({LINK})")
+        told = tab.value("[...document.querySelectorAll('#outage p')].map((line) => line.innerText)")
+        assert "remote control" in told[2]
+        assert all(told)
+        buttons = "[...document.querySelectorAll('#commands button')]"
+        assert set(tab.value(f"{buttons}.map((item) => item.disabled && item.title !== '')")) == {True}
+        assert not tab.value("document.querySelector('#stop').disabled")
+        assert tab.value("document.querySelector('#off').innerText")
+        with publishing(endpoint) as (service, _):
+            wait_for(shown)
+            tab.until("document.querySelector('#outage').hidden")
+            assert not tab.value("document.querySelector('[data-command=land]').disabled")
 
 
 def test_page_says_how_an_endless_command_has_ended(window: Tab) -> None:
