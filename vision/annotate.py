@@ -14,6 +14,7 @@ from vision.camera_model import CameraModel
 from vision.depth import centre_depth
 from vision.detections import NO_TRACK, Detections
 from vision.frame import Frame
+from vision.labels import Rectangle, place_label
 from vision.levelling import Levelling
 from vision.markers import Marker
 
@@ -28,7 +29,6 @@ _RED = (0, 0, 255)
 NOT_LEVEL = "not level: no attitude at the capture"
 
 Colour = tuple[int, int, int]
-Rectangle = tuple[int, int, int, int]  # left, top, right, bottom; the last two outside
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +92,7 @@ def annotate(
     Args:
         image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
         detections: each gets a box in its class's colour and a label: name, track and range where known,
-            confidence.
+            confidence. A label covers no other one; where there is no room for it, it is left out.
         lines: text for a panel at the top left.
         highlight: index of the detection to highlight: drawn last, tinted, with bracketed corners.
         centre_m: depth at the image's centre, metres, drawn beside a red point there; NaN: unknown; None: no
@@ -125,19 +125,21 @@ def annotate(
 
     def draw_labels(indices: Sequence[int]) -> None:
         for index in reversed(indices):  # the most confident choose their label's position first
-            occupied.append(_draw_label(drawn, boxes[index], detections, index, sizes, occupied))
+            _draw_label(drawn, boxes[index], detections, index, sizes, occupied)
+
+    def draw_texts(image: NDArray[np.uint8]) -> list[Rectangle]:
+        panel = [_draw_panel(image, lines, sizes)] if lines else []
+        return panel if centre_m is None else [*panel, _draw_centre(image, centre_m, sizes)]
 
     faint = [index for index in order if float(detections.confidence[index]) < faint_below]
     if faint:
+        occupied += draw_texts(drawn.copy())  # they come on top
         draw_boxes(faint)
         draw_labels(faint)
         cv2.addWeighted(image, 0.5, drawn, 0.5, 0.0, dst=drawn)
     strong = [index for index in order if index not in faint]
     draw_boxes(strong)
-    if lines:
-        occupied.append(_draw_panel(drawn, lines, sizes))
-    if centre_m is not None:
-        occupied.append(_draw_centre(drawn, centre_m, sizes))
+    occupied += draw_texts(drawn)
     draw_labels(strong)
     return drawn
 
@@ -152,6 +154,7 @@ def annotate_markers(
     """
     drawn = image.copy()
     sizes = _Sizes.of(drawn.shape[1], drawn.shape[0])
+    occupied: list[Rectangle] = []
     for marker in markers:
         outline = _subpixels(marker.corners_px)
         cv2.polylines(drawn, [outline], True, _LIGHT, sizes.line, cv2.LINE_AA, _SHIFT)
@@ -161,9 +164,14 @@ def annotate_markers(
             cv2.line(drawn, centre, tip, colour, sizes.line, cv2.LINE_AA, _SHIFT)
         text = f"{marker.identifier}  {float(np.linalg.norm(marker.position_camera_m)):.2f} m"
         (width, height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
-        left, top = round(float(marker.corners_px[:, 0].min())), round(float(marker.corners_px[:, 1].max()))
-        top += sizes.padding
-        right, bottom = left + width + 2 * sizes.padding, top + height + baseline + sizes.padding
+        outlined = np.array([marker.corners_px.min(axis=0), marker.corners_px.max(axis=0)], np.float32)
+        box = _pixels(outlined.reshape(4), drawn.shape[1], drawn.shape[0])
+        size = width + 2 * sizes.padding, height + baseline + sizes.padding
+        place = place_label(box, size, (drawn.shape[1], drawn.shape[0]), occupied)
+        if place is None:
+            continue
+        occupied.append(place)
+        left, top, right, bottom = place
         cv2.rectangle(drawn, (left, top), (right, bottom), _DARK, cv2.FILLED)
         at = (left + sizes.padding, top + sizes.padding // 2 + height)
         cv2.putText(drawn, text, at, _FONT, sizes.font_scale, _LIGHT, sizes.stroke, cv2.LINE_AA)
@@ -215,8 +223,9 @@ def _draw_label(
     detections: Detections,
     index: int,
     sizes: _Sizes,
-    occupied: Sequence[Rectangle],
-) -> Rectangle:
+    occupied: list[Rectangle],
+) -> None:
+    """Draw a label where there is room, and note its place in `occupied`."""
     class_id = int(detections.class_id[index])
     text = f"{detections.class_names[class_id]}{_identity(detections, index)} "
     text += f"{float(detections.confidence[index]):.2f}"
@@ -224,15 +233,16 @@ def _draw_label(
     if not np.isnan(depth_m):
         text += f"  depth {depth_m:.1f} m"
     (text_width, text_height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
-    label_width = text_width + 2 * sizes.padding
-    label_height = text_height + baseline + sizes.padding
-    label = _label_rectangle(box, label_width, label_height, image.shape[1], image.shape[0], occupied)
+    size = text_width + 2 * sizes.padding, text_height + baseline + sizes.padding
+    label = place_label(box, size, (image.shape[1], image.shape[0]), occupied)
+    if label is None:
+        return
+    occupied.append(label)
     colour = class_colour(class_id)
     left, top, right, bottom = label
     cv2.rectangle(image, (left, top), (right - 1, bottom - 1), colour, cv2.FILLED)
     at = (left + sizes.padding, top + sizes.padding // 2 + text_height)
     cv2.putText(image, text, at, _FONT, sizes.font_scale, _ink_on(colour), sizes.stroke, cv2.LINE_AA)
-    return label
 
 
 def _identity(detections: Detections, index: int) -> str:
@@ -241,46 +251,6 @@ def _identity(detections: Detections, index: int) -> str:
         return ""
     confirmed = detections.track_confirmed is not None and bool(detections.track_confirmed[index])
     return f" #{int(detections.track_id[index])}{'' if confirmed else '?'}"
-
-
-def _label_rectangle(
-    box: Rectangle,
-    width: int,
-    height: int,
-    image_width: int,
-    image_height: int,
-    occupied: Sequence[Rectangle],
-) -> Rectangle:
-    """Rectangle of the label: above its box, inside, below, or nearby, where it overlaps least."""
-    box_left, box_top, box_right, box_bottom = box
-    left = min(max(box_left - 1, 0), max(image_width - width, 0))
-    end = min(max(box_right - width + 1, 0), max(image_width - width, 0))
-    tops = (
-        box_top - height,
-        box_top,
-        box_bottom,
-        box_bottom - height,
-        box_top - 2 * height,
-        box_bottom + height,
-    )
-    positions = [(x, y) for y in tops for x in (left, end) if 0 <= y <= image_height - height]
-    if not positions:
-        positions = [(left, min(max(box_top - height, 0), max(image_height - height, 0)))]
-    rectangles = [(x, y, x + width, y + height) for x, y in positions]
-    # A label that hides its own small object is nearly as bad as one that hides another label.
-    small = (box_right - box_left) * (box_bottom - box_top) < 3 * width * height
-    return min(
-        rectangles,
-        key=lambda label: (
-            sum(_overlap(label, other) for other in occupied) + (_overlap(label, box) // 2 if small else 0)
-        ),
-    )
-
-
-def _overlap(one: Rectangle, other: Rectangle) -> int:
-    across = min(one[2], other[2]) - max(one[0], other[0])
-    down = min(one[3], other[3]) - max(one[1], other[1])
-    return max(across, 0) * max(down, 0)
 
 
 def _draw_panel(image: NDArray[np.uint8], lines: Sequence[str], sizes: _Sizes) -> Rectangle:

@@ -2,7 +2,7 @@
 // fewer images, never older ones. The cameras take turns: a browser has six connections to one host, and one
 // has to be free for a stop command.
 
-import { drawBox } from "./canvas.js";
+import { drawBoxes } from "./canvas.js";
 import { openMenu, send } from "./commands.js";
 import { $, button, cameras, pause, setText, state } from "./state.js";
 
@@ -163,10 +163,8 @@ export class Camera {
     g.font = `600 ${13 * scale}px system-ui, sans-serif`;
     g.textBaseline = "top";
     g.setLineDash(about.boxes_sequence === about.sequence ? [] : [6 * scale, 4 * scale]);
-    for (const box of about.boxes) {
-      const isChosen = box[6] != null && box[6] === state.chosen;
-      if (!about.annotated || isChosen) drawBox(g, box, isChosen, scale); // else it is in the image
-    }
+    const isChosen = (box) => box[6] != null && box[6] === state.chosen;
+    drawBoxes(g, about.annotated ? about.boxes.filter(isChosen) : about.boxes, state.chosen, scale);
     g.setLineDash([]);
     if (this.drag && this.drag.moved) {
       const [l, t, r, b] = this.drag.box;

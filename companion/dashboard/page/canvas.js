@@ -1,5 +1,7 @@
 // What several modules draw with, and the boxes in the video.
 
+import { placeLabel } from "./labels.js";
+
 const CHOSEN = "#ffd23f";
 const CONFIRMED = "#39e07f";
 const TENTATIVE = "#c9d1dc";
@@ -31,28 +33,44 @@ export function drawLine(g, ...points) {
   g.stroke();
 }
 
-// Draws a box, in fractions of the video's width and height, with its label.
-export function drawBox(g, [l, t, r, b, name, confidence, id, kind], isChosen, scale) {
-  const { width, height, clientWidth } = g.canvas;
-  const isTentative = kind === "tentative" || kind === "none";
-  const colour = isChosen ? CHOSEN : isTentative ? TENTATIVE : CONFIRMED;
-  const x = l * width;
-  const y = t * height;
-  const h = (b - t) * height;
+// Draws boxes, in fractions of the video's width and height, with their labels: the chosen and the confirmed ones
+// choose the place of theirs first.
+export function drawBoxes(g, boxes, chosen, scale) {
+  const rank = (box) => box[6] != null && box[6] === chosen ? 0 : isUnsure(box) ? 2 : 1;
+  const inOrder = [...boxes].sort((one, other) => rank(one) - rank(other));
+  for (const box of [...inOrder].reverse()) drawBox(g, box, rank(box) === 0, scale);
+  const occupied = [];
+  for (const box of inOrder) drawLabel(g, box, rank(box) === 0, scale, occupied);
+}
+
+const isUnsure = (box) => box[7] === "tentative" || box[7] === "none";
+const colourOf = (box, isChosen) => isChosen ? CHOSEN : isUnsure(box) ? TENTATIVE : CONFIRMED;
+
+function drawBox(g, box, isChosen, scale) {
+  const { width, height } = g.canvas;
+  const [l, t, r, b] = box;
+  const colour = colourOf(box, isChosen);
   for (const [style, thickness] of [["#000a", 2], [colour, 0]]) {
     g.strokeStyle = style;
     g.lineWidth = ((isChosen ? 4 : 2) + thickness) * scale;
-    g.strokeRect(x, y, (r - l) * width, h);
+    g.strokeRect(l * width, t * height, (r - l) * width, (b - t) * height);
   }
+}
+
+function drawLabel(g, box, isChosen, scale, occupied) {
+  const { width, height, clientWidth } = g.canvas;
+  const [l, t, r, b, name, confidence, id] = box;
   const words = [name];
   if (id != null) words.push(`#${id}`);
   if (clientWidth >= 420) words.push(Number(confidence).toFixed(2));
   const text = words.join(" ");
   const line = 18 * scale;
   const size = g.measureText(text).width + 8 * scale;
-  const left = Math.max(0, Math.min(x, width - size));
-  const top = y >= line ? y - line : Math.min(y + h, height - line);
-  g.fillStyle = colour;
+  const place = placeLabel([l * width, t * height, r * width, b * height], [size, line], [width, height], occupied);
+  if (!place) return;
+  occupied.push(place);
+  const [left, top] = place;
+  g.fillStyle = colourOf(box, isChosen);
   g.fillRect(left, top, size, line);
   g.fillStyle = "#0b0e12";
   g.fillText(text, left + 4 * scale, top + 2 * scale);
