@@ -1,4 +1,4 @@
-// Steering by keys or a gamepad: while the command `velocity` flies, a velocity goes to the service ten times a
+// Steering by keys, a gamepad, or sticks on a touch screen: while the command `velocity` flies, a velocity goes to the service ten times a
 // second, also a zero one. Without them the vehicle brakes: nothing here needs to be sent when the page is lost.
 
 import { HEADERS, send } from "./commands.js";
@@ -16,9 +16,15 @@ const KEYS = {
 // Axes of the Gamepad API's standard layout, as a remote control's in mode 2.
 const STICKS = { turn: [0, 1], up: [1, -1], right: [2, 1], forward: [3, -1] };
 
+const isTouch = matchMedia("(pointer: coarse)").matches;
+const HINT = isTouch
+  ? "Steer shows two sticks: the left one climbs and turns, the right one flies."
+  : "Keys: W A S D fly, arrows climb and turn. Gamepad: left stick climbs and turns, right stick flies.";
+
 // One of this page, also when it steers again: its last message is still valid then.
 const source = `page-${Math.random().toString(36).slice(2, 10)}`;
 const pressed = new Set();
+const touched = { forward: 0, right: 0, up: 0, turn: 0 }; // by the sticks on the screen
 let steering = null; // { vehicle, since, timer, sending }
 
 function begin() {
@@ -27,7 +33,7 @@ function begin() {
   document.activeElement.blur();
   const timer = setInterval(tick, PERIOD_MS);
   steering = { vehicle: state.vehicle, since: performance.now(), timer, sending: false };
-  show("Steering: W A S D fly, arrows climb and turn.");
+  show(isTouch ? "Steering: the sticks are at the bottom." : "Steering: W A S D fly, arrows climb and turn.");
 }
 
 function end(reason) {
@@ -36,11 +42,13 @@ function end(reason) {
   post(steering, { forward: 0, right: 0, up: 0, turn: 0 });
   steering = null;
   pressed.clear();
+  for (const axis of Object.keys(touched)) touched[axis] = 0;
   show(reason);
 }
 
 function show(text) {
   $("steer").setAttribute("aria-pressed", steering !== null);
+  $("sticks").hidden = !isTouch || steering === null;
   setText($("steered"), text);
 }
 
@@ -58,7 +66,7 @@ function tick() {
 
 // What keys and sticks ask for, each axis from -1 to 1.
 function wanted() {
-  const axes = { forward: 0, right: 0, up: 0, turn: 0 };
+  const axes = { ...touched };
   for (const code of pressed) axes[KEYS[code][0]] += KEYS[code][1];
   const pad = document.hasFocus() && navigator.getGamepads().find((one) => one && one.mapping === "standard");
   for (const [axis, [index, sign]] of Object.entries(pad ? STICKS : {})) axes[axis] += sign * stick(pad.axes[index]);
@@ -87,6 +95,30 @@ async function post(to, { forward, right, up, turn }) {
     to.sending = false;
   }
 }
+
+// A stick follows the finger that has pressed it, and springs back.
+for (const pad of document.querySelectorAll(".stick")) {
+  const { x, y } = pad.dataset;
+  const move = (event) => {
+    if (!pad.hasPointerCapture(event.pointerId)) return;
+    const box = pad.getBoundingClientRect();
+    const clamp = (value) => Math.max(-1, Math.min(1, value));
+    set(clamp(2 * (event.clientX - box.left) / box.width - 1), clamp(1 - 2 * (event.clientY - box.top) / box.height));
+  };
+  const set = (across, up) => {
+    touched[x] = stick(across);
+    touched[y] = stick(up);
+    pad.lastElementChild.style.transform = `translate(${across * 2.2}rem, ${-up * 2.2}rem)`;
+  };
+  pad.addEventListener("pointerdown", (event) => {
+    event.preventDefault();
+    pad.setPointerCapture(event.pointerId);
+    move(event);
+  });
+  pad.addEventListener("pointermove", move);
+  for (const name of ["pointerup", "pointercancel", "lostpointercapture"]) pad.addEventListener(name, () => set(0, 0));
+}
+show(HINT);
 
 $("steer").addEventListener("click", () => {
   if (steering) {

@@ -9,8 +9,9 @@ import re
 import socket
 import time
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -65,6 +66,8 @@ REPLY = "document.querySelector('#reply').textContent"
 LINK = "(document.querySelector('#link')?.textContent ?? '')"
 
 
+ROOT_FOLDER = Path(__file__).parent.parent.parent.parent
+AXE = ROOT_FOLDER / "node_modules" / "axe-core" / "axe.min.js"
 OPENED = """
 location.protocol === 'http:' && document.readyState === 'complete'
   && Promise.all(['state', 'stream', 'cameras'].map((name) => import(`/${name}.js`)))
@@ -530,6 +533,126 @@ def test_page_shows_the_state_and_the_menu_of_a_track(window: Tab) -> None:
         wait_for(lambda: shown() and tab.value("state.topics.status.gimbal !== null"))
         tab.press("Enter", "\r")
         assert text("#menu button") == ["Follow", "Approach", "Orbit", "Point gimbal"]
+
+
+SEEN = {
+    "mode": "offboard", "armed": True, "altitude_m": 4.0, "battery_fraction": 0.7, "yaw_rad": 1.6,
+    "attitude_wxyz": [0.9659, 0.2588, 0.0, 0.0], "velocity_ned_mps": [1.0, 0.0, 0.0],
+    "position_ned_m": [3.0, 4.0, -4.0],
+}  # fmt: skip
+NOT_HEALTHY = {
+    "service": "s", "stamp_ns": 1, "healthy": False, "unhealthy": ["camera: no result for 3.1 s"],
+    "vehicle": {"autopilot": "PX4", "silence": {"text": "without setpoints PX4 holds its position"}},
+    "parts": [{"name": "autopilot", "state": "ready", "reason": "", "next_try_ns": None}],
+    "pilot": {"mission": MISSION, "behaviour": "holding"}, "limits": {}, "gimbal": None,
+    "perception": {"state": "running", "class_names": ["person", "car"], "rate_hz": 7.0, "problem": ""},
+}  # fmt: skip
+LOOKS: dict[str, dict[str, Any]] = {
+    "light": {"width": 1280, "height": 900},
+    "dark": {"width": 1280, "height": 900, "dark": True},
+    "phone": {"width": 390, "height": 844, "phone": True},
+    "dark phone": {"width": 390, "height": 844, "phone": True, "dark": True},
+}
+
+
+@contextmanager
+def populated(window: Tab, look: str) -> Iterator[tuple[Tab, Callable[[], None]]]:
+    """The page with something in every part; what is yielded with it ends the service."""
+    jpeg = cv2.imencode(".jpg", np.full((480, 640, 3), 90, np.uint8))[1].tobytes()
+    messages = {
+        STATUS.key(NAME): NOT_HEALTHY,
+        VEHICLE.key(NAME): SEEN,
+        SETPOINT.key(NAME): {"asked": SEEN, "sent": SEEN, "limited_by": ["speed"]},
+        DETECTIONS.key(NAME): frame(1, captured_ns=1, published_ns=35_000_000),
+        EVENTS.key(NAME): {"stamp_ns": 1, "level": "warning", "text": "battery 7"},
+    }
+    with ExitStack() as stack:
+        endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        url = stack.enter_context(dashboard_here(endpoint))
+        running = stack.enter_context(ExitStack())
+        service, _ = running.enter_context(publishing(endpoint))
+        tab = stack.enter_context(page_at(window, url))
+        tab.resize(**LOOKS[look])
+        tab.send("Page.reload")  # the kind of pointer is read once
+        tab.until(OPENED)
+
+        def shown() -> bool:
+            for key, body in messages.items():
+                service.publish(key, body)
+            service.image(1, jpeg)
+            parts = "#log li, #detections td button, #steps li, figcaption, #class option"
+            everything = f"'{parts}'.split(', ').every((part) => document.querySelector(part))"
+            return bool(tab.value(f"state.topics.status && {everything}"))
+
+        answering({NAME: service}, id="s-1", state="in_progress", reason="in progress")
+        wait_for(shown)
+        tab.value("document.querySelector('[data-command=hold]').click()")
+        tab.until(f"{REPLY} === 'hold: accepted, in progress'")
+        tab.until("/not healthy: camera: no result/.test(document.querySelector('#link').textContent)")
+        yield tab, running.close
+
+
+def violations(tab: Tab) -> list[str]:
+    """What axe finds against WCAG 2.2, A and AA."""
+    levels = "['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa', 'wcag22aa']"
+    found = tab.value(f"axe.run(document, {{runOnly: {levels}}})")["violations"]
+    return [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]]
+
+
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core: npm install --no-save axe-core")
+@pytest.mark.parametrize("look", LOOKS)
+def test_page_is_accessible(window: Tab, look: str) -> None:
+    with populated(window, look) as (tab, end_service):
+        tab.value(f"{AXE.read_text()}; 0")
+        assert violations(tab) == []
+        tab.value("document.querySelector('#detections button').click()")
+        assert violations(tab) == []
+        tab.press("Escape")
+        end_service()
+        tab.until("!document.querySelector('#outage').hidden")
+        assert violations(tab) == []
+
+
+def test_phone_has_large_targets_sticks_and_a_stop_that_covers_nothing(window: Tab) -> None:
+    with populated(window, "phone") as (tab, _):
+        shown = "[...document.querySelectorAll('button, input, select')].filter((one) => one.offsetParent)"
+        small = "({width, height}) => width < 44 || height < 44"
+        tab.value("document.querySelector('#detections button').click()")
+        boxes = f"{shown}.map((one) => [one.outerHTML, one.getBoundingClientRect()])"
+        assert tab.value(f"{boxes}.filter(([, box]) => ({small})(box)).map(([html]) => html)") == []
+        tab.press("Escape")
+        assert "W A S D" not in tab.value("document.body.innerText")
+        assert "space bar" not in tab.value("document.body.innerText").lower()
+        edges = "['header', 'main', '#sticks', '#stops'].map((one) => document.querySelector(one))"
+        spans = f"{edges}.filter((one) => one.offsetParent || one.tagName === 'MAIN')"
+        spans += ".map((one) => one.getBoundingClientRect()).map(({top, bottom}) => [top, bottom])"
+        for scroll in (0, 10_000):
+            tab.value(f"document.querySelector('main').scrollTo(0, {scroll})")
+            rows = tab.value(spans)
+            assert all(above[1] <= below[0] + 0.5 for above, below in itertools.pairwise(rows)), rows
+        tab.value("document.querySelector('#steer').click()")
+        tab.until(STEERING)
+        assert tab.value("!document.querySelector('#sticks').hidden")
+        left, top, width, _ = rectangle(tab, "[data-y=forward]")
+        press = f"{{bubbles: true, pointerId: 1, clientX: {left + width / 2}, clientY: {top + 1}}}"
+        # A synthetic event has no pointer that could be captured.
+        tab.value("""
+            globalThis.sent = [];
+            const native = globalThis.fetch;
+            globalThis.fetch = (url, more) => {
+              if (url === '/velocity') sent.push(JSON.parse(more.body));
+              return native(url, more);
+            };
+            for (const pad of document.querySelectorAll('.stick')) {
+              pad.setPointerCapture = () => null;
+              pad.hasPointerCapture = () => true;
+            }
+        """)
+        pad = "document.querySelector('[data-y=forward]')"
+        tab.value(f"{pad}.dispatchEvent(new PointerEvent('pointerdown', {press}))")
+        tab.until("sent.some((one) => one.forward_mps > 0.9 && Math.abs(one.right_mps) < 0.1)")
+        tab.value(f"{pad}.dispatchEvent(new PointerEvent('pointerup', {press})); sent.length = 0")
+        tab.until("sent.some((one) => one.forward_mps === 0)")
 
 
 def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(window: Tab) -> None:
