@@ -49,6 +49,9 @@ export function onCommandState(message) {
   ends.add(message);
 }
 
+// The message of a command's end; undefined: it has not ended, as far as known here.
+export const endOf = (id) => ends.of(id);
+
 // Shows the reply to the last command, and once that has ended, why.
 export function showAnswer() {
   if (!answered) return;

@@ -1,13 +1,12 @@
 // Steering by keys, a gamepad, or sticks on a touch screen: while the command `velocity` flies, a velocity goes to the service ten times a
 // second, also a zero one. Without them the vehicle brakes: nothing here needs to be sent when the page is lost.
 
-import { HEADERS, send } from "./commands.js";
+import { endOf, HEADERS, send } from "./commands.js";
 import { $, setText, state } from "./state.js";
 
 const PERIOD_MS = 100;
 const LIFETIME_S = 0.4;
 const DEAD_ZONE = 0.12;
-const STATUS_AFTER_MS = 2500; // by then `status` names the command
 // By their position on the keyboard, whatever its layout.
 const KEYS = {
   KeyW: ["forward", 1], KeyS: ["forward", -1], KeyD: ["right", 1], KeyA: ["right", -1],
@@ -25,14 +24,14 @@ const HINT = isTouch
 const source = `page-${Math.random().toString(36).slice(2, 10)}`;
 const pressed = new Set();
 const touched = { forward: 0, right: 0, up: 0, turn: 0 }; // by the sticks on the screen
-let steering = null; // { vehicle, since, timer, sending }
+let steering = null; // { vehicle, id, timer, sending }
 
-function begin() {
+function begin({ command_id: id }) {
   if (steering) clearInterval(steering.timer);
   pressed.clear();
   document.activeElement.blur();
   const timer = setInterval(tick, PERIOD_MS);
-  steering = { vehicle: state.vehicle, since: performance.now(), timer, sending: false };
+  steering = { vehicle: state.vehicle, id, timer, sending: false };
   show(isTouch ? "Steering: the sticks are at the bottom." : "Steering: W A S D fly, arrows climb and turn.");
 }
 
@@ -53,12 +52,14 @@ function show(text) {
 }
 
 function tick() {
-  const { vehicle, since, sending } = steering;
-  const { behaviour = "" } = (state.topics.status || {}).pilot || {};
+  const { vehicle, id, sending } = steering;
+  const ended = endOf(id);
   if (vehicle !== state.vehicle) {
     end("Another vehicle is shown.");
-  } else if (performance.now() - since > STATUS_AFTER_MS && !behaviour.startsWith(`velocity of ${source}`)) {
-    end(`The vehicle flies something else: ${behaviour}.`);
+  } else if (ended) {
+    end(`Ended: ${ended.reason}.`);
+  } else if (state.outage) {
+    end("Ended: the service does not answer.");
   } else if (!sending) {
     post(steering, wanted());
   }

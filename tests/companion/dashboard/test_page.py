@@ -614,7 +614,7 @@ def test_page_is_accessible(window: Tab, look: str) -> None:
 
 
 def test_phone_has_large_targets_sticks_and_a_stop_that_covers_nothing(window: Tab) -> None:
-    with populated(window, "phone") as (tab, _):
+    with populated(window, "phone") as (tab, end_service):
         shown = "[...document.querySelectorAll('button, input, select')].filter((one) => one.offsetParent)"
         small = "({width, height}) => width < 44 || height < 44"
         tab.value("document.querySelector('#detections button').click()")
@@ -653,6 +653,8 @@ def test_phone_has_large_targets_sticks_and_a_stop_that_covers_nothing(window: T
         tab.until("sent.some((one) => one.forward_mps > 0.9 && Math.abs(one.right_mps) < 0.1)")
         tab.value(f"{pad}.dispatchEvent(new PointerEvent('pointerup', {press})); sent.length = 0")
         tab.until("sent.some((one) => one.forward_mps === 0)")
+        end_service()
+        tab.until("document.querySelector('#sticks').hidden")
 
 
 def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(window: Tab) -> None:
