@@ -28,6 +28,8 @@ class Endings:
         self._ended: OrderedDict[str, CommandStateBody] = OrderedDict()
         self._waiting: dict[str, asyncio.Future[CommandStateBody]] = {}
         self._gone = False
+        self._silence = "the autopilot's failsafe applies"
+        self._status = subscribe_kept(session, topics.STATUS.key(vehicle), self._on_status)
         self._alive = session.liveliness().declare_subscriber(topics.alive_key(vehicle), self._on_alive)
         self._states = subscribe_kept(session, topics.COMMAND_STATE.key(vehicle), self._on_state)
 
@@ -47,8 +49,8 @@ class Endings:
     def _no_answer(self, identifier: str) -> NoAnswerError:
         return NoAnswerError(
             f"command {identifier}: the service of vehicle {self._vehicle!r} has gone before its end: it was "
-            "stopped or killed, or the network was lost. The autopilot's failsafe applies; check the vehicle "
-            "and the service's log"
+            f"stopped or killed, or the network was lost. In offboard mode {self._silence}; be ready to take "
+            "over, and check the service's log"
         )
 
     # --- in the loop
@@ -77,6 +79,11 @@ class Endings:
             body = parse_object(copy_payload(sample.payload, topics.COMMAND_STATE.largest_bytes))
             if body["state"] == "ended" and isinstance(body["id"], str):
                 self._loop.call_soon_threadsafe(self._take, cast(CommandStateBody, body))
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        with suppress(PeerDataError, KeyError, TypeError):
+            status = parse_object(copy_payload(sample.payload, topics.STATUS.largest_bytes))
+            self._silence = str(status["vehicle"]["silence"]["text"])
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         with suppress(RuntimeError):
