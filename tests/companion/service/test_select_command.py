@@ -47,6 +47,8 @@ class Cameras:
             lambda: None,
             lambda *event: self.events.append(event),
             check_requirements=lambda _: "flies nothing",
+            on_state=lambda _: None,
+            service="service1",
         )
 
 
