@@ -57,6 +57,7 @@ def seen(captured_ns: int) -> PerceptionResult:
 
 
 def set_state(service: Service, state: VehicleState) -> None:
+    service.driver.link_count = 1  # type: ignore[misc]
     service.driver._telemetry.state = state  # type: ignore[attr-defined]
     service._on_state(state)
 
@@ -143,7 +144,7 @@ def test_recorded_camera_has_a_calibration_that_arrives_later() -> None:
 @pytest.mark.realtime
 async def test_gimbal_command_without_a_gimbal_is_refused() -> None:
     service = service_of()
-    service.ready = True
+    service.ready, service.driver.link_count = True, 1  # type: ignore[misc]
     steering = asyncio.create_task(service._loop.run())
     reply = await service.command("gimbal pitch=-30")
     assert not reply["success"]
