@@ -18,12 +18,12 @@ export class Ends {
 }
 
 // Returns [text, kind] of a reply: "good", "bad", "ended" or "waiting". `service`: that of the newest status, if one
-// is known; a command of another one has ended with it. `isStale`: nothing is heard of the service.
+// is known; a command of another one has ended with it. `isStale`: the service does not answer.
 export function outcome({ command_id: id, state, success, reason }, ends, service, isStale = false) {
   if (state !== "in_progress") return [`${success ? "done" : "failed"}: ${reason}`, success ? "good" : "bad"];
   const end = ends.of(id);
   if (end) return [`ended: ${end.reason}`, "ended"];
   if (service && id && !id.startsWith(`${service}-`)) return ["ended: the service has been started again", "ended"];
-  if (isStale) return [`${reason} when the service was last heard`, "waiting"];
+  if (isStale) return [`${reason} when the service last answered`, "waiting"];
   return [`accepted, ${reason}`, "good"];
 }

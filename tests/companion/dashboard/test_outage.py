@@ -27,7 +27,7 @@ def said(**changed: Any) -> dict[str, str] | None:
     return value
 
 
-def test_nothing_is_said_while_the_service_is_heard() -> None:
+def test_nothing_is_said_while_the_service_answers() -> None:
     assert said() is None
     assert said(alive=None, oldS=3.9) is None
     assert said(alive=False, oldS=None, status=None, vehicle=None) is None
@@ -43,11 +43,11 @@ def test_nothing_is_said_while_the_service_is_heard() -> None:
     ],
 )
 def test_outage_says_what_happened_and_how_old_it_is(changed: dict[str, Any], word: str) -> None:
-    told = said(**changed)
-    assert told is not None
-    assert word in told["what"]
-    assert f"{changed.get('oldS', 1.0):.0f} s" in told["what"]
-    assert "remote control" in told["todo"]
+    lines = said(**changed)
+    assert lines is not None
+    assert word in lines["what"]
+    assert f"{changed.get('oldS', 1.0):.0f} s" in lines["what"]
+    assert "remote control" in lines["todo"]
 
 
 @pytest.mark.parametrize(
@@ -63,24 +63,24 @@ def test_outage_says_what_happened_and_how_old_it_is(changed: dict[str, Any], wo
 def test_what_the_vehicle_does_follows_from_its_last_mode(
     vehicle: dict[str, Any] | None, words: tuple[str, ...], absent: tuple[str, ...]
 ) -> None:
-    told = said(**GONE, vehicle=vehicle)
-    assert told is not None
-    assert [word for word in words if word not in told["vehicle"]] == []
-    assert [word for word in absent if word in told["vehicle"]] == []
+    lines = said(**GONE, vehicle=vehicle)
+    assert lines is not None
+    assert [word for word in words if word not in lines["vehicle"]] == []
+    assert [word for word in absent if word in lines["vehicle"]] == []
 
 
 def test_lost_connection_is_not_taken_for_a_lost_service() -> None:
-    told = said(problem="connection lost")
-    assert told is not None
-    assert "if its service still runs" in told["vehicle"]
-    assert "orbiting" in told["vehicle"]
-    assert SILENCE["text"] in told["vehicle"]
+    lines = said(problem="connection lost")
+    assert lines is not None
+    assert "if its service still runs" in lines["vehicle"]
+    assert "orbiting" in lines["vehicle"]
+    assert SILENCE["text"] in lines["vehicle"]
 
 
 def test_outage_without_a_vehicle_or_its_failsafe_says_so() -> None:
-    told = said(**GONE, status={"parts": [{"name": "camera"}]})
-    assert told is not None
-    assert "no vehicle" in told["vehicle"]
-    told = said(**GONE, status={"vehicle": {}})
-    assert told is not None
-    assert "not known" in told["vehicle"]
+    lines = said(**GONE, status={"parts": [{"name": "camera"}]})
+    assert lines is not None
+    assert "no vehicle" in lines["vehicle"]
+    lines = said(**GONE, status={"vehicle": {}})
+    assert lines is not None
+    assert "not known" in lines["vehicle"]

@@ -1,4 +1,4 @@
-"""The labels in the video, by the page's own function in node: as those of drawn pictures."""
+"""The labels in the video, by the page's own function in node: as those of annotated images."""
 
 from __future__ import annotations
 

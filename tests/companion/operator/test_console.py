@@ -38,7 +38,7 @@ class Service:
         if text == "break":
             raise ZeroDivisionError("no such luck")
         if text == "orbit":  # it has no end
-            return {"success": True, "reason": "in progress"}
+            return {"state": "in_progress", "success": True, "reason": "in progress"}
         return {"success": text != "seek dragon", "reason": f"reason {len(self.asked)}"}
 
     def stop(self) -> None:

@@ -205,7 +205,7 @@ async def test_mission_that_is_read_across_a_suspend_is_not_flown(monkeypatch: p
     assert handler.take_commands() == ()
 
 
-def told(handler: Handler) -> list[tuple[str, str, bool | None, str]]:
+def states_of(handler: Handler) -> list[tuple[str, str, bool | None, str]]:
     return [(one["id"], one["state"], one["success"], one["reason"]) for one in handler.states]
 
 
@@ -217,7 +217,7 @@ async def test_every_command_has_one_last_state_with_its_reason() -> None:
     second, _ = await handler.until_started("hold")
     handler.on_results([], [CommandResult(first, Outcome(False, "replaced by hold"))])
     handler.close("the service ends")
-    assert told(handler) == [
+    assert states_of(handler) == [
         (refused["id"], "ended", False, "refused 7"),
         ((await flown)["id"], "accepted", None, ""),
         (f"s-{first}", "in_progress", None, "in progress"),
@@ -241,4 +241,7 @@ async def test_unreadable_command_and_selection_end_too() -> None:
     handler._read, handler._select = read, selected
     assert (await handler.execute("dance"))["id"] == "s-1"
     assert (await handler.execute("select"))["track"] == 4
-    assert told(handler) == [("s-1", "ended", False, "unknown 9"), ("s-2", "ended", True, "following it")]
+    assert states_of(handler) == [
+        ("s-1", "ended", False, "unknown 9"),
+        ("s-2", "ended", True, "following it"),
+    ]

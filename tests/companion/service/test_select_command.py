@@ -85,6 +85,8 @@ async def test_reply_has_track_and_class_and_nothing_is_flown() -> None:
     cameras = Cameras()
     reply = await cameras.handler.execute("select x=0.4 y=0.3 width=0.1 height=0.2")
     assert reply == {
+        "id": "service1-1",
+        "state": "ended",
         "command": "select x=0.4 y=0.3 width=0.1 height=0.2",
         "success": True,
         "reason": "track 7, a target",
