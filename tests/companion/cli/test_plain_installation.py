@@ -49,6 +49,7 @@ ENDS = ""  # ends, with output or one line of its own
 WALK: list[tuple[str, tuple[str, ...], str]] = [
     ("run", ("--vehicle-url", "bad"), ENDS),
     ("play", ("--autopilot", "none"), ENDS),
+    ("view", ("none",), ENDS),
     ("demo", ("--seeds", "2..1"), ENDS),
     ("detect", ("demo.png", "--image-size", "320"), ENDS),
     ("detect", ("demo.png", "--model", "old.pt"), "torch"),
