@@ -26,6 +26,7 @@ from companion.guidance.command import COMMANDS
 from companion.settings import Settings
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
+from vision.catalog import KNOWN
 from vision.object_detector import YOLO
 from vision.weights import DEFAULT_WEIGHTS
 
@@ -347,9 +348,10 @@ def test_detect_warns_of_a_model_of_rendered_scenes(
     done = companion_here("detect", image_folder, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
+    offered = KNOWN[line.rpartition("--model ")[2]]
+    assert (offered.licence, Path(offered.file).suffix) == ("Apache-2.0", ".onnx")  # needs no extra
     assert f"'{model}'" in line
     assert "camera images" in line
-    assert "--model yolo11n" in line
 
 
 def test_detect_is_silent_about_another_model(small_model: Path, image_folder: Path, tmp_path: Path) -> None:
