@@ -117,6 +117,10 @@ KNOWN: dict[str, KnownModel] = {
 }
 
 
+CAMERA_MODEL = "yolox_s"
+"""For camera images, where no model is named: Apache-2.0, and it runs on what a plain installation has."""
+
+
 def known_by_digest(sha256: str) -> KnownModel | None:
     """Return the official model whose file has this SHA-256; None if there is none."""
     return next((model for model in KNOWN.values() if model.sha256 == sha256), None)

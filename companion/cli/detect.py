@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, YOLO, plain_errors, warn_rendered_only
+from companion.cli.models import Pull, model_after_pull
 from companion.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
@@ -71,6 +72,7 @@ def detect(
     plugins_modules: Annotated[
         str | None, typer.Option(help="Plug-ins to load: modules or names, comma separated.")
     ] = None,
+    pull: Pull = False,
 ) -> None:
     """Detect objects in the frames of a source. Prints a line per frame, and a summary on standard error.
 
@@ -93,6 +95,8 @@ def detect(
         if save is not None:
             make_save_folder(save, source)
         load_plugins(parse_words(plugins_modules))
+        if pull:
+            model = model_after_pull(model, [source])
         wanted = DetectorSettings(
             model,
             classes=parse_classes(classes),

@@ -133,8 +133,8 @@ def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:
         if not uri.startswith("shm://"):
             text = (
                 f"companion: the model '{model}' is trained on rendered scenes only and does not work on "
-                "camera images; if these are camera images, run `companion models pull yolox_s` (Apache-2.0) "
-                "and use --model yolox_s"
+                "camera images; if these are camera images, add --pull: it downloads yolox_s (Apache-2.0) "
+                "and uses it; or give your own --model"
             )
             typer.echo(marked_for_journal(text, logging.WARNING), err=True)
             return

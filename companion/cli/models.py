@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from companion.cli.flags import plain_errors
 
+if TYPE_CHECKING:
+    from companion.models.pull import Pulled
+
 models = typer.Typer(help="List, inspect, download, export and verify models.", no_args_is_help=True)
 
+Pull = Annotated[
+    bool,
+    typer.Option(
+        "--pull",
+        help="Download the model first if it is not there; without --model yolox_s, Apache-2.0.",
+    ),
+]
 _JSON = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 _FOLDER = Annotated[
     Path | None,
@@ -92,9 +103,18 @@ def pull(
     url: Annotated[str | None, typer.Option(help="Mirror URL of the same file.")] = None,
 ) -> None:
     """Download an official model. Verifies its SHA-256 and resumes an interrupted download."""
+    pulled = pull_named(name, folder, url)
+    typer.echo(
+        f"{pulled.path} ({'downloaded' if pulled.fetched else 'already present'}), SHA-256 {pulled.sha256}"
+    )
+
+
+def pull_named(name: str, folder: Path | None = None, url: str | None = None) -> Pulled:
+    """Download an official model, as `companion models pull`. Exits with code 2 if that fails."""
     import difflib
 
-    from companion.models.pull import PullError, at_address, pull
+    from companion.models.pull import PullError, at_address
+    from companion.models.pull import pull as download
     from vision.catalog import KNOWN, LICENCE_NOTES
     from vision.model_files import models_folder
 
@@ -105,14 +125,28 @@ def pull(
         raise typer.Exit(2)
     typer.echo(f"{known.name}: {LICENCE_NOTES[known.licence]}", err=True)
     with plain_errors(PullError), _DownloadBar(known.file) as progress:
-        pulled = pull(
-            known if url is None else at_address(known, url),
-            folder or models_folder(),
-            progress=progress,
+        return download(
+            known if url is None else at_address(known, url), folder or models_folder(), progress=progress
         )
-    typer.echo(
-        f"{pulled.path} ({'downloaded' if pulled.fetched else 'already present'}), SHA-256 {pulled.sha256}"
-    )
+
+
+def model_after_pull(model: str, sources: Iterable[str]) -> str:
+    """Return the model to use with `--pull`: this one, downloaded if it is not there.
+
+    Instead of the bundled one, which knows rendered scenes only, it is `CAMERA_MODEL` where a source is no
+    rendered camera of the simulator.
+    """
+    from vision.catalog import CAMERA_MODEL
+    from vision.detector import DEFAULT_MODEL
+    from vision.model_files import find_model
+
+    if model == DEFAULT_MODEL:
+        if all(source.startswith("shm://") for source in sources):
+            return model
+        model = CAMERA_MODEL
+    if not find_model(model).exists():
+        pull_named(model)
+    return model
 
 
 @models.command()

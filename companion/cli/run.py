@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from companion.cli.flags import EXIT_FAILED, EXIT_PASSING, plain_errors, warn_rendered_only
+from companion.cli.models import Pull, model_after_pull
 from companion.journal import log_to_standard_error
 from companion.tasks import spawn
 from vision.gc_pause import gc_paused
@@ -24,13 +25,22 @@ if TYPE_CHECKING:
 _REMIND_S = 5.0
 
 
-def run(settings: Settings) -> None:
+def run(settings: Settings, pull: Pull = False) -> None:
     """Run the service.
 
     It starts with what is there: autopilot and camera are used as soon as they come. Exit code 2: wrong
     settings; 75: another start may succeed.
     """
-    run_service(settings)
+    run_service(after_pull(settings) if pull else settings)
+
+
+def after_pull(settings: Settings) -> Settings:
+    """Return the settings with the model of `--pull`, which is downloaded if it is not there."""
+    sources = [settings.of_camera(name).source.uri for name in (None, *settings.cameras)]
+    detector = settings.detector.model_copy(
+        update={"model": model_after_pull(settings.detector.model, sources)}
+    )
+    return settings.model_copy(update={"detector": detector})
 
 
 def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: None) -> None:

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT
-from companion.cli.run import run_service
+from companion.cli.models import Pull
+from companion.cli.run import after_pull, run_service
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -25,6 +26,7 @@ def view(
     source: Annotated[
         str, typer.Argument(help="File, folder, /dev/video0, csi://0, FIFO, - (standard input) or URL.")
     ],
+    pull: Pull = False,
 ) -> None:
     """Show a source live in the browser, with its detections.
 
@@ -40,7 +42,8 @@ def view(
     loop = settings.source.loop or ("source.loop" not in given and settings.source.depth is None)
     shown = settings.source.model_copy(update={"uri": source, "loop": loop})
     vehicle = settings.vehicle.model_copy(update={"url": NO_VEHICLE})
-    run_service(settings.model_copy(update={"source": shown, "vehicle": vehicle}), _open_page)
+    settings = settings.model_copy(update={"source": shown, "vehicle": vehicle})
+    run_service(after_pull(settings) if pull else settings, _open_page)
 
 
 def _refused(settings: Settings, given: Mapping[str, str], *, is_none: bool) -> str | None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -13,9 +14,13 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
+from companion.cli.models import model_after_pull
 from companion.models.pull import PullError, at_address, pull
-from vision.catalog import KNOWN, KnownModel, known_by_digest
+from vision.catalog import CAMERA_MODEL, KNOWN, KnownModel, known_by_digest
+from vision.weights import DEFAULT_EXPORT
+from vision.yolo.checkpoint_pair import file_sha256
 
+IMAGE = str(Path(__file__).parents[3] / "docs/images/demo.png")
 CONTENT = bytes(range(256)) * 2000
 DIGEST = hashlib.sha256(CONTENT).hexdigest()
 
@@ -199,3 +204,42 @@ def test_every_model_has_unique_digest_and_official_url() -> None:
         assert len(bytes.fromhex(model.sha256)) == 32
         assert model.size_bytes > 3_000_000
     assert known_by_digest(KNOWN["yolo11n"].sha256) is KNOWN["yolo11n"]
+
+
+def test_pull_of_a_command_downloads_once_and_uses_the_model(
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path))
+    server.content = DEFAULT_EXPORT.read_bytes()
+    known = replace(KNOWN[CAMERA_MODEL], size_bytes=len(server.content), sha256=file_sha256(DEFAULT_EXPORT))
+    monkeypatch.setitem(KNOWN, CAMERA_MODEL, at_address(known, server.url))
+    for _ in range(2):
+        result = CliRunner().invoke(app, ["detect", IMAGE, "--pull", "--json"])
+        assert result.exit_code == 0, result.output
+        (line,) = result.stdout.splitlines()
+        assert json.loads(line)["detections"]
+    assert server.requests == [None]
+    assert [path.name for path in tmp_path.iterdir()] == [f"{CAMERA_MODEL}.onnx"]
+
+
+@pytest.mark.parametrize(
+    ("model", "sources", "used", "downloaded"),
+    [
+        ("default", ["shm://front"], "default", []),
+        ("default", ["shm://front", "/dev/video0"], CAMERA_MODEL, [CAMERA_MODEL]),
+        ("yolo11n", ["shm://front"], "yolo11n", ["yolo11n"]),
+        (str(DEFAULT_EXPORT), ["video.mp4"], str(DEFAULT_EXPORT), []),
+    ],
+)
+def test_pull_chooses_the_model_by_the_sources(
+    model: str,
+    sources: list[str],
+    used: str,
+    downloaded: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path))
+    pulled: list[str] = []
+    monkeypatch.setattr("companion.cli.models.pull_named", pulled.append)
+    assert (model_after_pull(model, sources), pulled) == (used, downloaded)
