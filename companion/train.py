@@ -34,6 +34,9 @@ from vision.yolo.recipe import DEFAULT_RECIPE, HELD_OUT_SEED, HELD_OUT_SIZE, NMS
 from vision.yolo.training import Progress, Stage, TrainedModel, TrainingSettings, train
 
 logger = logging.getLogger(__name__)
+
+# A smaller difference of mAP is not called worse.
+_WORSE = 0.005
 LICENCE = "Apache-2.0"
 USUAL_EPOCHS = 40
 
@@ -141,6 +144,16 @@ class FineTuning:
     before: Score | None
     after: Score
     held_out: bool
+
+    @property
+    def worse(self) -> tuple[str, ...]:
+        """The classes of the validation images that the starting model found better, by mAP50-95."""
+        before = {} if self.before is None else self.before.per_class
+        return tuple(
+            name
+            for name, one in self.after.per_class.items()
+            if one.objects and name in before and before[name].ap50_95 - one.ap50_95 > _WORSE
+        )
 
 
 def train_on_data(
@@ -274,6 +287,11 @@ def score_lines(result: FineTuning) -> list[str]:
         old50, old95 = ("-", "-") if old is None else (f"{old.ap50:.3f}", f"{old.ap50_95:.3f}")
         lines.append(
             f"{name:<{width}}  {new.objects:7d}  {old50:>13}  {new.ap50:.3f}  {old95:>16}  {new.ap50_95:.3f}"
+        )
+    if result.worse:
+        lines.append(
+            f"worse than the model it started from: {', '.join(result.worse)}; more images or a lower "
+            "--learning-rate may help, else keep that model"
         )
     return lines
 

@@ -16,10 +16,11 @@ from typer.testing import CliRunner, Result
 
 import companion.train
 from companion.cli import app
-from companion.train import train_default, train_on_data
+from companion.train import FineTuning, score_lines, train_default, train_on_data
 from vision.detector import Detector
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_pair import weights_sha256
+from vision.yolo.metrics import ClassScore, Score
 from vision.yolo.recipe import DEFAULT_RECIPE, REFINEMENT
 from vision.yolo.training import Stage
 
@@ -279,3 +280,24 @@ def test_sixteen_photographs_are_learned(tmp_path: Path) -> None:
     assert result.before.map50 < 0.9
     assert result.after.map50 >= 0.95
     assert not result.held_out
+
+
+def scored(**ap: float) -> Score:
+    mean = sum(ap.values()) / len(ap)
+    return Score(mean, mean, {name: ClassScore(one, one, 10) for name, one in ap.items()}, 20)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "worse"),
+    [
+        (scored(car=0.6, boat=0.5), scored(car=0.4, boat=0.6), ("car",)),
+        (scored(car=0.6), scored(car=0.598, kite=0.1), ()),
+        (None, scored(kite=0.1), ()),
+    ],
+)
+def test_training_that_ends_worse_says_so(before: Score | None, after: Score, worse: tuple[str, ...]) -> None:
+    result = FineTuning(before, after, held_out=True)
+    assert result.worse == worse
+    named = [line for line in score_lines(result) if line.startswith("worse")]
+    assert len(named) == bool(worse)
+    assert all(name in named[0] for name in worse)
