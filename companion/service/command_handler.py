@@ -28,6 +28,8 @@ REPORTED_PER_S, REPORTED_AT_ONCE = 1.0, 20
 LASTING_S = 1.0
 # A mission of 100 kB takes up to 0.5 s.
 READING_S = 5.0
+# Of a command and a reason in its states, which are kept; a valid command is not longer.
+LONGEST_TEXT = 8000
 
 
 class CommandHandler:
@@ -213,10 +215,10 @@ class CommandHandler:
             {
                 "stamp_ns": time.monotonic_ns(),
                 "id": command_id(self._service, identifier),
-                "command": text,
+                "command": text[:LONGEST_TEXT],
                 "state": state,
                 "success": outcome.success if outcome is not None and state == "ended" else None,
-                "reason": "" if outcome is None else outcome.reason,
+                "reason": "" if outcome is None else outcome.reason[:LONGEST_TEXT],
             }
         )
 

@@ -18,7 +18,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command import GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.service import command_handler
-from companion.service.command_handler import REPORTED_AT_ONCE, REPORTED_PER_S, CommandHandler
+from companion.service.command_handler import LONGEST_TEXT, REPORTED_AT_ONCE, REPORTED_PER_S, CommandHandler
 from vision.tracking import Selected
 
 FLOOD = 300
@@ -245,3 +245,11 @@ async def test_unreadable_command_and_selection_end_too() -> None:
         ("s-1", "ended", False, "unknown 9"),
         ("s-2", "ended", True, "following it"),
     ]
+
+
+async def test_text_of_a_refused_command_is_kept_in_part() -> None:
+    handler = Handler()
+    reply = await handler.execute("goto " * 32_000)
+    assert len(reply["command"]) > LONGEST_TEXT
+    (state,) = [one for one in handler.states if one["state"] == "ended"]
+    assert len(state["command"]) == LONGEST_TEXT
