@@ -29,6 +29,8 @@ class Release:
             in SITL, there is no such file. Its metadata is announced without one.
         checks_sticks: in the fallback of a mode that is no longer possible.
         has_current_mode: CURRENT_MODE is sent (since v1.15).
+        override_by_speed: MAN_OVERRIDE_SPD is the pilot's override by sticks, in every mode (since v1.18);
+            before, COM_RC_OVERRIDE and COM_RC_STICK_OV are.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Release:
     checks_sticks: SticksCheck
     has_current_mode: bool = True
     joins_ftp_paths: bool = True
+    override_by_speed: bool = False
 
 
 # FIRMWARE_VERSION_TYPE: 255 is a release, 128 a beta.
@@ -48,7 +51,7 @@ RELEASES = {
         Release("1.15", 0x010F00FF, False, False, SticksCheck.NEVER, joins_ftp_paths=False),
         Release("1.16", 0x011000FF, True, False, SticksCheck.NEVER),
         Release("1.17", 0x011100FF, True, True, SticksCheck.SETPOINTS_LOST),
-        Release("1.18", 0x01120080, False, True, SticksCheck.ALWAYS),
+        Release("1.18", 0x01120080, False, True, SticksCheck.ALWAYS, override_by_speed=True),
     )
 }
 NEWEST = "1.17"  # the newest one that is released

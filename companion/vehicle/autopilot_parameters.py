@@ -17,6 +17,7 @@ DEFAULT_ACCEPTANCE_M = 0.8
 # COM_RC_IN_MODE: PX4 ignores all stick input.
 STICKS_DISABLED = 4
 _OFFBOARD_OVERRIDE = 2  # bit of COM_RC_OVERRIDE
+_OVERRIDE_SPEED = "MAN_OVERRIDE_SPD"  # by source of v1.18.0-beta1; negative: off
 _IGNORE_PILOT_YAW = 4  # bit of GUID_OPTIONS
 _DO_NOT_STABILIZE_VELOCITY = 32  # bit of GUID_OPTIONS: Copter then reports the velocity that it has reached
 # Since then POSITION_TARGET_LOCAL_NED is the setpoint as it was sent. PX4: flown with v1.14.4, v1.16.2 and
@@ -27,7 +28,6 @@ PX4_PARAMETERS = (
     "COM_OF_LOSS_T",
     "COM_OBL_RC_ACT",
     "COM_RC_IN_MODE",
-    "COM_RC_OVERRIDE",
     "NAV_RCL_ACT",
     "NAV_MC_ALT_RAD",
     "MPC_XY_VEL_MAX",
@@ -111,14 +111,20 @@ class AutopilotParameters:
             return f"sticks do nothing in GUIDED, {yaw}; a pilot takes over by selecting a mode"
         if self.get("COM_RC_IN_MODE") == STICKS_DISABLED:
             return "PX4 ignores all sticks (COM_RC_IN_MODE 4)"
-        override = self.get("COM_RC_OVERRIDE")
+        name = stick_override_name(self.version)
+        override = self.get(name)
         if override is None:
-            return "COM_RC_OVERRIDE could not be read: sticks may do nothing in OFFBOARD"
-        if int(override) & _OFFBOARD_OVERRIDE:
-            return f"moving the sticks takes over from OFFBOARD (COM_RC_OVERRIDE {override:g})"
+            return f"{name} could not be read: sticks may do nothing in OFFBOARD"
+        if name == _OVERRIDE_SPEED:
+            quickly, taking_over, needed = "quickly ", override >= 0.0, 1
+        else:
+            quickly, taking_over = "", bool(int(override) & _OFFBOARD_OVERRIDE)
+            needed = int(override) | _OFFBOARD_OVERRIDE
+        if taking_over:
+            return f"moving the sticks {quickly}takes over from OFFBOARD ({name} {override:g})"
         return (
-            f"sticks do nothing in OFFBOARD (COM_RC_OVERRIDE {override:g}): a pilot takes over by selecting "
-            f"a mode; {int(override) | _OFFBOARD_OVERRIDE} lets moved sticks take over"
+            f"sticks do nothing in OFFBOARD ({name} {override:g}): a pilot takes over by selecting a mode; "
+            f"{needed} lets {quickly}moved sticks take over"
         )
 
 
@@ -126,12 +132,18 @@ NOTHING_READ = AutopilotParameters()
 
 
 def parameter_names(autopilot: str | None, version: FirmwareVersion | None) -> tuple[str, ...]:
-    """Return the names to read from an autopilot. ArduPilot renamed its ground station's id in 4.7."""
+    """Return the names to read from an autopilot, as its version has them."""
     if autopilot == "PX4":
-        return PX4_PARAMETERS
+        return (*PX4_PARAMETERS, stick_override_name(version))
     if autopilot == "ArduPilot":
         return (*ARDUPILOT_PARAMETERS, ground_station_name(version))
     return ()
+
+
+def stick_override_name(version: FirmwareVersion | None) -> str:
+    """Return PX4's parameter with what moved sticks do in OFFBOARD."""
+    by_speed = version is not None and (version.major, version.minor) >= (1, 18)
+    return _OVERRIDE_SPEED if by_speed else "COM_RC_OVERRIDE"
 
 
 def ground_station_name(version: FirmwareVersion | None) -> str:

@@ -2,7 +2,8 @@
 
 Sources are a remote control and the joysticks of ground stations (MANUAL_CONTROL, one source per link);
 COM_RC_IN_MODE selects among them, COM_RC_LOSS_T is how long one stays valid. Gestures (MAN_ARM_GESTURE,
-MAN_KILL_GEST_T), switches, and sticks moved faster than COM_RC_STICK_OV become requests and `moved`.
+MAN_KILL_GEST_T), switches, and sticks moved faster than COM_RC_STICK_OV (v1.18: MAN_OVERRIDE_SPD) become
+requests and `moved`.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from enum import Enum, IntEnum
 
 from mavlink_sim.flight.transmitter import CENTRED, MODE_OF_SETTING, Sticks, Switches
 from mavlink_sim.px4.modes import Mode
-from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.px4.parameters import OVERRIDE_SPEED, Parameters
 
 MOVEMENT_FILTER_S = 0.1
+OVERRIDE_FILTER_S, OVERRIDE_SAMPLES = 0.05, 3  # of MAN_OVERRIDE_SPD: that many samples in one direction
 GESTURE_S = 1.0  # duration of the sticks in the corner
 _LOW = -0.8
 _CORNER = 0.9
@@ -69,7 +71,8 @@ class ManualControl:
         self.source = int(Source.UNKNOWN)
         self._sampled_s = -math.inf
         self._first_source = int(Source.UNKNOWN)
-        self._rates: list[float] | None = None  # filtered, of roll, pitch, yaw, throttle in 1/s
+        self._rates = [0.0] * 4  # filtered, of roll, pitch, yaw, throttle in 1/s
+        self._runs = [0] * 4  # of each: how many changes in one direction, negative ones as negative numbers
         self._moved = False
         self._gesture_since: dict[RequestKind, float | None] = {}
         self._switches: Switches | None = None
@@ -123,7 +126,7 @@ class ManualControl:
         return requests
 
     def take_moved(self) -> bool:
-        """Whether the sticks moved faster than COM_RC_STICK_OV since the last call."""
+        """Whether the sticks moved faster than the threshold of an override since the last call."""
         moved, self._moved = self._moved, False
         return moved
 
@@ -145,7 +148,7 @@ class ManualControl:
             self.valid = False
             self.sticks = CENTRED
             self.source = int(Source.UNKNOWN)
-            self._rates = None
+            self._rates, self._runs = [0.0] * 4, [0] * 4
             self._moved = False
             self._gesture_since.clear()
             self._switches = None
@@ -180,15 +183,25 @@ class ManualControl:
     def _watch_movement(self, sticks: Sticks, dt_s: float) -> None:
         if dt_s <= 0.0:
             return
-        blend = dt_s / (dt_s + MOVEMENT_FILTER_S)
+        by_speed = OVERRIDE_SPEED in self._parameters
+        blend = dt_s / (dt_s + (OVERRIDE_FILTER_S if by_speed else MOVEMENT_FILTER_S))
         rates = [
             (after - before) / dt_s
             for after, before in zip(astuple(sticks), astuple(self.sticks), strict=True)
         ]
-        filtered = self._rates or [0.0] * len(rates)
-        self._rates = [old + blend * (new - old) for old, new in zip(filtered, rates, strict=True)]
-        limit = 0.01 * self._parameters.number("COM_RC_STICK_OV")
-        self._moved = self._moved or any(abs(rate) > limit for rate in self._rates)
+        self._rates = [old + blend * (new - old) for old, new in zip(self._rates, rates, strict=True)]
+        if by_speed:
+            limit, samples = self._parameters.number(OVERRIDE_SPEED), OVERRIDE_SAMPLES
+        else:
+            limit, samples = 0.01 * self._parameters.number("COM_RC_STICK_OV"), 0
+        self._runs = [_run(run, rate) for run, rate in zip(self._runs, rates, strict=True)]
+        self._moved = self._moved or (
+            limit >= 0.0
+            and any(
+                abs(rate) > limit and abs(run) >= samples
+                for rate, run in zip(self._rates, self._runs, strict=True)
+            )
+        )
 
     def _watch_gestures(self, sticks: Sticks, now_s: float) -> None:
         centred = abs(sticks.roll) < _NEAR_CENTRE and abs(sticks.pitch) < _NEAR_CENTRE
@@ -223,3 +236,11 @@ class ManualControl:
 
     def _request(self, kind: RequestKind, by: str, mode: Mode | None = None) -> None:
         self._requests.append(Request(kind, by, mode))
+
+
+def _run(run: int, rate: float) -> int:
+    """Return how many changes have had one direction, with the newest; no change does not count."""
+    if rate == 0.0:
+        return run
+    direction = 1 if rate > 0.0 else -1
+    return run + direction if run * direction > 0 else direction

@@ -22,7 +22,7 @@ from mavlink_sim.missions.navigator import Navigator
 from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.battery import Battery, BatteryWarning
 from mavlink_sim.px4.modes import MANUAL_MODES, MODES_PREVENTING_ARMING, Mode
-from mavlink_sim.px4.parameters import Parameters
+from mavlink_sim.px4.parameters import OVERRIDE_SPEED, Parameters
 from mavlink_sim.releases import Release
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text, event_identifier
 
@@ -404,9 +404,10 @@ class Supervision:
             return False
         if not moved or autopilot.mode in MANUAL_MODES:
             return False
-        bit = OFFBOARD_OVERRIDE if autopilot.mode is Mode.OFFBOARD else AUTO_OVERRIDE
-        if not int(self._parameters.number("COM_RC_OVERRIDE")) & bit:
-            return False
+        if OVERRIDE_SPEED not in self._parameters:
+            bit = OFFBOARD_OVERRIDE if autopilot.mode is Mode.OFFBOARD else AUTO_OVERRIDE
+            if not int(self._parameters.number("COM_RC_OVERRIDE")) & bit:
+                return False
         if self.failsafes.in_failsafe:
             return True
         if autopilot.set_mode(Mode.POSCTL) == ACCEPTED:

@@ -24,6 +24,8 @@ NO_INDEX = 65535  # of what is not listed: _HASH_CHECK, and a parameter that no 
 _FILE = "parameters.txt"
 _MISSION_FILE = "parameters_mission.txt"
 _GIMBAL_FILE = "parameters_gimbal.txt"
+OVERRIDE_SPEED = "MAN_OVERRIDE_SPD"
+_FORMER_OVERRIDE = ("COM_RC_OVERRIDE", "COM_RC_STICK_OV")
 _TYPES = {"INT32": INT32, "REAL32": REAL32}
 # PX4's `volatile` parameters: the vehicle itself changes them, so _HASH_CHECK excludes them.
 _VOLATILE = re.compile(
@@ -87,8 +89,12 @@ def default_parameters(gimbal: bool = False) -> list[Parameter]:
 
 
 @cache
-def _defaults(gimbal: bool) -> Mapping[str, Parameter]:
-    return {parameter.name: parameter for parameter in default_parameters(gimbal)}
+def _defaults(gimbal: bool, override_by_speed: bool) -> Mapping[str, Parameter]:
+    found = {parameter.name: parameter for parameter in default_parameters(gimbal)}
+    if not override_by_speed:
+        return found
+    found[OVERRIDE_SPEED] = Parameter(OVERRIDE_SPEED, REAL32, 1.0)
+    return {name: found[name] for name in sorted(found) if name not in _FORMER_OVERRIDE}
 
 
 @cache
@@ -109,12 +115,20 @@ class Parameters:
     Its length, its iteration and its indices are those of the list that clients get, in alphabetical order.
     """
 
-    def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
+    def __init__(
+        self,
+        values: Mapping[str, float] | None = None,
+        gimbal: bool = False,
+        override_by_speed: bool = False,
+    ) -> None:
         """Start from the defaults, with `gimbal` those of a gimbal too.
+
+        Args:
+            override_by_speed: see `releases.Release`.
 
         Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`.
         """
-        self._gimbal = gimbal
+        self._gimbal, self._override_by_speed = gimbal, override_by_speed
         self._defaults = self._default_set()
         self._parameters = dict(self._defaults)
         self._unused = {parameter.name for parameter in _read(_MISSION_FILE)}
@@ -125,7 +139,7 @@ class Parameters:
 
     def _default_set(self) -> Mapping[str, Parameter]:
         """The defaults by name, shared by all vehicles with the same ones."""
-        return _defaults(self._gimbal)
+        return _defaults(self._gimbal, self._override_by_speed)
 
     def __getstate__(self) -> dict[str, Any]:
         """Only what differs from the defaults: a copy of a vehicle shares them."""

@@ -166,7 +166,7 @@ class Vehicle:
     ) -> None:
         self.system_id = system_id
         self.release = release_named(NEWEST if px4 is None else px4)
-        self.parameters = self.parameters_class(parameters, gimbal)
+        self.parameters = self.parameters_class(parameters, gimbal, self.release.override_by_speed)
         self.parameters.set("MAV_SYS_ID", system_id)
         if wind_mps:
             direction = random.Random(seed if air_seed is None else air_seed).uniform(0.0, math.tau)

@@ -276,8 +276,8 @@ def test_a_flickering_condition_uses_up_the_delay() -> None:
 # ---- on the vehicle
 
 
-def flying(**values: float) -> SimHarness:
-    harness = SimHarness(parameters={**REMOTE_CONTROL, **values})
+def flying(px4: str | None = None, **values: float) -> SimHarness:
+    harness = SimHarness(parameters={**REMOTE_CONTROL, **values}, px4=px4)
     harness.heartbeats.append(("gcs", GROUND_STATION, 6))
     harness.vehicle.transmitter.on = True
     harness.take_off(12.0)
@@ -384,6 +384,45 @@ def test_sticks_take_over_in_offboard_if_enabled(override: int, taken_over: bool
     harness.vehicle.transmitter.sticks = Sticks(yaw=0.6)
     harness.fly(0.5, velocity_setpoint(0.5, 0, 0))
     assert harness.mode == ("POSCTL" if taken_over else "OFFBOARD")
+
+
+@pytest.mark.parametrize("auto", [True, False], ids=["auto", "offboard"])
+@pytest.mark.parametrize(
+    ("speed_limit", "travel_per_s", "seconds", "taken_over"),
+    [
+        pytest.param(1.0, 2.0, 0.2, True, id="quickly"),
+        pytest.param(1.0, 0.8, 1.0, False, id="slowly"),
+        pytest.param(1.0, 40.0, 0.02, False, id="in one sample"),
+        pytest.param(5.0, 3.0, 0.3, False, id="slower than the limit"),
+        pytest.param(-1.0, 4.0, 0.2, False, id="off"),
+    ],
+)
+def test_sticks_override_of_1_18(
+    auto: bool, speed_limit: float, travel_per_s: float, seconds: float, taken_over: bool
+) -> None:
+    harness = flying("1.18", MAN_OVERRIDE_SPD=speed_limit)
+    setpoint = None if auto else velocity_setpoint(0.5, 0, 0)
+    if auto:
+        harness.set_mode(4, 3)
+    else:
+        harness.offboard(setpoint)
+    harness.fly(0.5, setpoint)
+    before = harness.mode
+    for number in range(round(seconds / 0.02)):
+        harness.vehicle.transmitter.sticks = Sticks(pitch=0.02 * travel_per_s * (number + 1))
+        harness.fly(0.02, setpoint)
+    harness.fly(0.3, setpoint)
+    assert harness.mode == ("POSCTL" if taken_over else before)
+    assert (PILOT_TOOK_OVER in harness.texts()) is taken_over
+
+
+@pytest.mark.parametrize("release", ["1.14", "1.15", "1.16", "1.17", "1.18"])
+def test_each_release_has_its_own_parameters_of_the_override(release: str) -> None:
+    parameters = SimHarness(px4=release).vehicle.parameters
+    names = {"COM_RC_OVERRIDE", "COM_RC_STICK_OV", "MAN_OVERRIDE_SPD"}
+    expected = {"MAN_OVERRIDE_SPD"} if release == "1.18" else {"COM_RC_OVERRIDE", "COM_RC_STICK_OV"}
+    assert {parameter.name for parameter in parameters} & names == expected
+    assert [parameter.name for parameter in parameters] == sorted(parameter.name for parameter in parameters)
 
 
 def test_sticks_moved_slowly_do_not_take_over() -> None:

@@ -142,7 +142,12 @@ def _copter_defaults() -> Mapping[str, Parameter]:
 class CopterParameters(Parameters):
     """Copter's set as clients see it; `number` also finds the hidden parameters of the loops."""
 
-    def __init__(self, values: Mapping[str, float] | None = None, gimbal: bool = False) -> None:
+    def __init__(
+        self,
+        values: Mapping[str, float] | None = None,
+        gimbal: bool = False,
+        override_by_speed: bool = False,
+    ) -> None:
         """Raises UnknownParameterError or ValueError for an unknown name or an invalid value in `values`."""
         self._loops = Parameters()
         self._defaults = self._default_set()

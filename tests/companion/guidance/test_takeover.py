@@ -7,7 +7,9 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.interface import EventKind
 from companion.vehicle.state import FlightMode
+from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.px4.modes import Mode
+from tests.mavlink_sim.conftest import CALIBRATION
 
 
 def flown_by(mode: Mode) -> LockstepFlight:
@@ -73,3 +75,36 @@ def test_refused_command_has_taken_nothing_over() -> None:
     assert not outcome.success
     assert "took over" not in outcome.reason
     assert flight.state.mode is FlightMode.POSITION
+
+
+@pytest.mark.parametrize(
+    ("release", "values", "taken_over"),
+    [
+        ("1.14", {}, False),
+        ("1.16", {}, False),
+        ("1.17", {"COM_RC_OVERRIDE": 3}, True),
+        ("1.18", {}, True),
+        ("1.18", {"MAN_OVERRIDE_SPD": -1}, False),
+    ],
+)
+def test_sticks_do_in_offboard_what_the_service_says(
+    release: str, values: dict[str, float], taken_over: bool
+) -> None:
+    parameters = {**CALIBRATION, "COM_RC_IN_MODE": 0, **values}
+    flight = LockstepFlight.airborne(seed=4, px4=release, parameters=parameters)
+    transmitter = flight.vehicle.vehicle.transmitter
+    transmitter.on = True
+    identifier = flight.command("goto north=40 east=0")
+    assert flight.run_until(lambda: flight.state.mode is FlightMode.OFFBOARD, 5.0)
+    for number in range(10):  # all the way in 0.5 s
+        transmitter.sticks = Sticks(roll=0.1 * number)
+        flight.run(0.05)
+    flight.run(0.5)
+    assert ("takes over from" in (flight.inputs.parameters.sticks_text or "")) is taken_over
+    outcome = flight.outcome(identifier)
+    assert (flight.state.mode is FlightMode.POSITION) is taken_over
+    if taken_over:
+        assert outcome is not None
+        assert outcome.reason.startswith("the pilot took over")
+    else:
+        assert outcome is None

@@ -89,17 +89,20 @@ async def check(
     return inputs, events
 
 
+V1_16, V1_18 = FirmwareVersion(1, 16), FirmwareVersion(1, 18)
 PX4_VALUES = {
     "COM_OF_LOSS_T": 1.0,
     "COM_OBL_RC_ACT": 0.0,
     "COM_RC_IN_MODE": 3.0,
-    "COM_RC_OVERRIDE": 1.0,
     "NAV_RCL_ACT": 2.0,
     "NAV_MC_ALT_RAD": 0.8,
     "MPC_XY_VEL_MAX": 12.0,
     "MPC_Z_VEL_MAX_UP": 3.0,
     "MPC_Z_VEL_MAX_DN": 1.5,
+    "MAN_OVERRIDE_SPD": 1.0,  # since v1.18
 }
+PX4_VALUES_BEFORE = {**PX4_VALUES, "COM_RC_OVERRIDE": 1.0}
+del PX4_VALUES_BEFORE["MAN_OVERRIDE_SPD"]
 COPTER_VALUES = {
     "GUID_TIMEOUT": 1.0,
     "GUID_OPTIONS": 0.0,
@@ -109,19 +112,24 @@ COPTER_VALUES = {
 }
 
 
-async def test_everything_is_read_once_for_guidance() -> None:
-    inputs, events = await check("PX4", PX4_VALUES, FirmwareVersion(1, 18))
-    assert inputs.parameters == AutopilotParameters(
-        "PX4", FirmwareVersion(1, 18), 1, tuple(PX4_VALUES.items())
-    )
+@pytest.mark.parametrize("kind", [128, 255])
+@pytest.mark.parametrize(
+    ("minor", "values"),
+    [*((minor, PX4_VALUES_BEFORE) for minor in (14, 15, 16, 17)), (18, PX4_VALUES), (19, PX4_VALUES)],
+)
+async def test_everything_is_read_once_for_guidance(minor: int, values: dict[str, float], kind: int) -> None:
+    version = FirmwareVersion(1, minor, 0, kind)
+    inputs, events = await check("PX4", values, version)
+    assert inputs.parameters == AutopilotParameters("PX4", version, 1, tuple(values.items()))
     assert "warning" not in [level for level, _ in events]
 
 
 async def test_what_cannot_be_read_is_reported_by_name() -> None:
     inputs, events = await check("PX4", {"COM_OF_LOSS_T": 1.0}, None)
     warned = [text for level, text in events if level == "warning"]
-    assert len(warned) == len(PX4_VALUES)  # all but one, and the version
-    assert sum(name in text for name in PX4_VALUES for text in warned) == len(PX4_VALUES) - 1
+    assert len(warned) == len(PX4_VALUES_BEFORE)  # all but one, and the version
+    named = sum(name in text for name in PX4_VALUES_BEFORE for text in warned)
+    assert named == len(PX4_VALUES_BEFORE) - 1
     assert inputs.parameters.get("NAV_MC_ALT_RAD") is None
 
 
@@ -166,20 +174,47 @@ async def test_effect_of_silence_is_reported_again_when_sticks_come() -> None:
 
 
 @pytest.mark.parametrize(
-    ("autopilot", "values", "words"),
+    ("version", "values", "words"),
     [
-        ("PX4", {}, "do nothing in OFFBOARD (COM_RC_OVERRIDE 1)"),
-        ("PX4", {"COM_RC_OVERRIDE": 3.0}, "moving the sticks takes over"),
-        ("PX4", {"COM_RC_IN_MODE": 4.0}, "ignores all sticks"),
-        ("ArduPilot", {}, "do nothing in GUIDED, the yaw stick turns"),
-        ("ArduPilot", {"GUID_OPTIONS": 4.0}, "do nothing in GUIDED, the yaw stick too"),
+        (V1_16, {"COM_RC_OVERRIDE": 1.0}, "do nothing in OFFBOARD (COM_RC_OVERRIDE 1)"),
+        (V1_16, {"COM_RC_OVERRIDE": 3.0}, "moving the sticks takes over from OFFBOARD (COM_RC_OVERRIDE 3)"),
+        (V1_16, {"COM_RC_OVERRIDE": 3.0, "COM_RC_IN_MODE": 4.0}, "ignores all sticks"),
+        (V1_16, {}, "COM_RC_OVERRIDE could not be read: sticks may do nothing"),
+        (
+            V1_18,
+            {"MAN_OVERRIDE_SPD": 1.0},
+            "moving the sticks quickly takes over from OFFBOARD (MAN_OVERRIDE",
+        ),
+        (
+            V1_18,
+            {"MAN_OVERRIDE_SPD": 0.0},
+            "moving the sticks quickly takes over from OFFBOARD (MAN_OVERRIDE",
+        ),
+        (V1_18, {"MAN_OVERRIDE_SPD": -1.0}, "do nothing in OFFBOARD (MAN_OVERRIDE_SPD -1)"),
+        (V1_18, {"COM_RC_OVERRIDE": 3.0}, "MAN_OVERRIDE_SPD could not be read: sticks may do nothing"),
+        (V1_18, {"MAN_OVERRIDE_SPD": 1.0, "COM_RC_IN_MODE": 4.0}, "ignores all sticks"),
+        (None, {}, "COM_RC_OVERRIDE could not be read: sticks may do nothing"),
     ],
 )
-async def test_effect_of_sticks_is_reported_at_connect(
-    autopilot: str, values: dict[str, float], words: str
+async def test_effect_of_sticks_on_px4_is_reported_at_connect(
+    version: FirmwareVersion | None, values: dict[str, float], words: str
 ) -> None:
-    defaults = PX4_VALUES if autopilot == "PX4" else COPTER_VALUES
-    _, events = await check(autopilot, {**defaults, **values}, FirmwareVersion(4, 7))
+    inputs, events = await check("PX4", values, version)
+    assert words in (inputs.parameters.sticks_text or "")
+    assert ("info", inputs.parameters.sticks_text) in events
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({}, "do nothing in GUIDED, the yaw stick turns"),
+        ({"GUID_OPTIONS": 4.0}, "do nothing in GUIDED, the yaw stick too"),
+    ],
+)
+async def test_effect_of_sticks_on_copter_is_reported_at_connect(
+    values: dict[str, float], words: str
+) -> None:
+    _, events = await check("ArduPilot", {**COPTER_VALUES, **values}, FirmwareVersion(4, 7))
     (line,) = said(events, about="sticks")
     assert line[0] == "info"
     assert words in line[1]
