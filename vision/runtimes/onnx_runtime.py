@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vision.foreign.layouts import ForeignFacts, Port, recognise
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, KEY, ExportedFacts, own_facts
-from vision.runtimes.onnx_trial import check_load
+from vision.runtimes.load_trial import check_load
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 # As ONNX Runtime names them. An available provider is used: its package was chosen for it.
@@ -116,7 +116,7 @@ def _ports(nodes: Any) -> list[Port]:
 def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -> Any:
     if not path.is_file():
         raise RuntimeUnusableError(f"{path}: no such file")
-    check_load(path)
+    check_load(path, "onnxruntime")
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     # Its errors have no common base class but Exception.

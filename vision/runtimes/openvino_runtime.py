@@ -15,6 +15,7 @@ from vision.plain_yaml import PlainYamlError, load_plain_yaml
 from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import KEY, SUFFIXES, ExportedFacts, own_facts
+from vision.runtimes.load_trial import check_load
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
@@ -202,6 +203,7 @@ def _check_head(path: Path) -> None:
 def _read(core: Any, path: Path) -> Any:
     if not path.is_file():
         raise RuntimeUnusableError(f"{path}: no such file")
+    check_load(path, "openvino")
     try:
         return core.read_model(str(path))
     except RuntimeError as error:

@@ -1,4 +1,4 @@
-"""ONNX files that ask for too much: small, and valid by their form."""
+"""Model files that ask for too much: small, and valid by their form."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vision.runtimes import onnx_trial
+from vision.runtimes import load_trial
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.onnx_runtime import onnx_facts, open_session
+from vision.runtimes.openvino_runtime import OpenVinoNetwork, openvino_facts
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -74,7 +75,7 @@ def test_network_that_takes_gigabytes_is_refused(tmp_path: Path) -> None:
 
 
 def test_network_that_never_ends_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onnx_trial, "LOAD_S", 5.0)
+    monkeypatch.setattr(load_trial, "LOAD_S", 5.0)
     path = nested(tmp_path / "nested.onnx", 40)
     with pytest.raises(RuntimeUnusableError, match=r" 5 s"):
         open_session(path, 1)
@@ -88,7 +89,7 @@ def test_usable_network_is_tried_once(tmp_path: Path, monkeypatch: pytest.Monkey
     def run(*_: object, **__: object) -> None:
         raise AssertionError("it is not tried again")
 
-    monkeypatch.setattr("vision.runtimes.onnx_trial.subprocess.run", run)
+    monkeypatch.setattr("vision.runtimes.load_trial.subprocess.run", run)
     open_session(path, 1)
     path.write_bytes(path.read_bytes() + b"\x00")
     with pytest.raises(AssertionError):
@@ -101,3 +102,45 @@ def test_other_errors_are_those_of_the_runtime(tmp_path: Path, content: bytes) -
     path.write_bytes(content)
     with pytest.raises(RuntimeUnusableError, match="onnxruntime cannot load it"):
         open_session(path, 1)
+
+
+# --- OpenVINO -----------------------------------------------------------------------------------------------
+
+
+def broadcast(path: Path, number: int) -> Path:
+    """An OpenVINO file with constants of 0.9 GB each, which are computed when it is compiled."""
+    openvino = pytest.importorskip("openvino")
+    ops = openvino.opset13
+    x = ops.parameter([1], np.float32, name="x")
+    total = x
+    for index in range(number):
+        length = ops.constant(np.array([225_000_000], np.int64))
+        large = ops.broadcast(ops.constant(np.array([index + 1.0], np.float32)), length)
+        first = ops.gather(large, ops.constant(np.array([0])), ops.constant(0))
+        total = ops.add(total, first)
+    openvino.save_model(openvino.Model([total], [x]), path)
+    return path
+
+
+def test_openvino_file_that_takes_gigabytes_is_refused(tmp_path: Path) -> None:
+    path = broadcast(tmp_path / "large.xml", 4)
+    for load in (lambda: openvino_facts(path), lambda: OpenVinoNetwork(path)):
+        with pytest.raises(RuntimeUnusableError, match="MiB") as caught:
+            load()
+        assert str(path) in str(caught.value)
+
+
+def test_openvino_tries_an_onnx_file_itself(tmp_path: Path) -> None:
+    pytest.importorskip("openvino")
+    with pytest.raises(RuntimeUnusableError, match=r"openvino .* MiB"):
+        OpenVinoNetwork(constants(tmp_path / "large.onnx", 4))
+
+
+def test_usable_openvino_file_is_tried_again_with_other_numbers(tmp_path: Path) -> None:
+    path = broadcast(tmp_path / "small.xml", 0)
+    OpenVinoNetwork(path)
+    marks = list((tmp_path / "cache").rglob("*.loads"))
+    assert len(marks) == 1
+    path.with_suffix(".bin").write_bytes(b"other")
+    OpenVinoNetwork(path)
+    assert len(list((tmp_path / "cache").rglob("*.loads"))) == 2

@@ -1,6 +1,7 @@
-"""Loads an ONNX file in a process of its own first: a few hundred bytes may ask for gigabytes, or never end.
+"""Loads a model file in a process of its own first: a few hundred bytes may ask for gigabytes, or never end.
 
 Nothing in the file says what loading takes: constants are computed, and functions are expanded in each other.
+A checkpoint needs no trial, its reader has limits of its own; TorchScript has none, it is a program.
 """
 
 from __future__ import annotations
@@ -10,22 +11,22 @@ import hashlib
 import os
 import subprocess
 import sys
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Callable
 from pathlib import Path
 
-from vision.runtimes.base import RuntimeUnusableError
+from vision.runtimes.base import RuntimeName, RuntimeUnusableError, required, version
 from vision.runtimes.stored_choice import cache_folder
 from vision.weights import DEFAULT_EXPORT
 
 LOAD_S = 60.0
 """A network of 270 MB takes 4 s on two cores."""
 MEMORY_BYTES, MEMORY_PER_BYTE = 1 << 30, 8
-"""What loading may take beside ONNX Runtime itself, and for each byte of the file."""
+"""What loading may take beside the runtime itself, and for each byte of the file."""
 _TOO_LARGE = 3  # exit code
 _ERRORS_ONLY = 3
 
 
-def check_load(path: Path) -> None:
+def check_load(path: Path, runtime: RuntimeName) -> None:
     """Check that a file is loaded within the limits; what else is wrong with it is for the caller to find.
 
     A file that was is not tried again. The bundled model is trusted as the code beside it.
@@ -36,48 +37,52 @@ def check_load(path: Path) -> None:
     if path == DEFAULT_EXPORT:
         return
     try:
-        marker = cache_folder() / f"onnx-{_digest(path)}.loads"
+        marker = cache_folder() / f"{runtime}-{_digest(path, runtime)}.loads"
         if marker.exists():
             return
-        command = [sys.executable, "-m", "vision.runtimes.onnx_trial", str(path)]
+        command = [sys.executable, "-m", "vision.runtimes.load_trial", runtime, str(path)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         done = subprocess.run(command, capture_output=True, timeout=LOAD_S, check=False, env=environment)
     except subprocess.TimeoutExpired:
         raise RuntimeUnusableError(
-            f"{path}: onnxruntime has not loaded it within {LOAD_S:g} s: it is damaged or made to harm; "
+            f"{path}: {runtime} has not loaded it within {LOAD_S:g} s: it is damaged or made to harm; "
             "export it again"
         ) from None
     except OSError as error:
         raise RuntimeUnusableError(f"{path}: cannot be read: {error.strerror or error}") from error
     if done.returncode == _TOO_LARGE:
         raise RuntimeUnusableError(
-            f"{path}: onnxruntime needs more than {_allowed(path) >> 20} MiB to load it: it is damaged or "
+            f"{path}: {runtime} needs more than {_allowed(path) >> 20} MiB to load it: it is damaged or "
             "made to harm; export it again"
         )
     if done.returncode != 0:
         last = (done.stderr.decode(errors="replace").strip().splitlines() or ["no output"])[-1]
         raise RuntimeUnusableError(
-            f"{path}: onnxruntime ends with code {done.returncode} when it loads it: {last[:200]}"
+            f"{path}: {runtime} ends with code {done.returncode} when it loads it: {last[:200]}"
         )
     with contextlib.suppress(OSError):  # it is tried again next time
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
 
 
-def _digest(path: Path) -> str:
+def _files(path: Path) -> list[Path]:
+    """Return the files of a model: OpenVINO's numbers are beside its `.xml`."""
+    beside = path.with_suffix(".bin")
+    return [path, beside] if path.suffix == ".xml" and beside.is_file() else [path]
+
+
+def _digest(path: Path, runtime: RuntimeName) -> str:
     """Return what identifies the file and the runtime that loads it."""
-    try:
-        runtime = version("onnxruntime")
-    except PackageNotFoundError:  # another package of it, for GPUs
-        runtime = ""
-    with path.open("rb") as file:
-        digest = hashlib.file_digest(file, "sha256")
-    digest.update(runtime.encode())
+    digest = hashlib.sha256()
+    for each in _files(path):
+        with each.open("rb") as file:
+            digest.update(hashlib.file_digest(file, "sha256").digest())
+    digest.update(version(runtime).encode())
     return digest.hexdigest()[:32]
 
 
 def _allowed(path: Path) -> int:
-    return MEMORY_BYTES + MEMORY_PER_BYTE * path.stat().st_size
+    return MEMORY_BYTES + MEMORY_PER_BYTE * sum(each.stat().st_size for each in _files(path))
 
 
 def _limit_memory(more_bytes: int) -> None:
@@ -90,16 +95,34 @@ def _limit_memory(more_bytes: int) -> None:
         resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
 
-def main(path: str) -> int:
-    """Load the file; returns the exit code."""
-    import onnxruntime
+# Each imports its runtime, and returns what loads the file. One thread: each reserves address space.
 
+
+def _onnxruntime(path: str) -> Callable[[], object]:
+    onnxruntime = required("onnxruntime")
     options = onnxruntime.SessionOptions()
     options.log_severity_level = _ERRORS_ONLY
-    options.intra_op_num_threads = 1  # each thread reserves address space
+    options.intra_op_num_threads = 1
+    return lambda: onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+
+def _openvino(path: str) -> Callable[[], object]:
+    core = required("openvino").Core()
+    return lambda: core.compile_model(core.read_model(path), "CPU", {"INFERENCE_NUM_THREADS": 1})
+
+
+_LOADERS: dict[str, Callable[[str], Callable[[], object]]] = {
+    "onnxruntime": _onnxruntime,
+    "openvino": _openvino,
+}
+
+
+def main(runtime: str, path: str) -> int:
+    """Load the file; returns the exit code."""
+    load = _LOADERS[runtime](path)
     _limit_memory(_allowed(Path(path)))
     try:
-        onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+        load()
     except MemoryError:
         return _TOO_LARGE
     except Exception as error:
@@ -109,4 +132,4 @@ def main(path: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main(*sys.argv[1:]))
