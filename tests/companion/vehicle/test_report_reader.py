@@ -129,6 +129,13 @@ async def test_missing_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         await FileReader(lambda *_: None, lambda: (1, 1)).read("etc/b.json")
 
 
+async def test_file_that_is_too_large_is_not_read() -> None:
+    autopilot = Autopilot({"etc/a.json": bytes(LARGEST_FILE + 1)})
+    with pytest.raises(FileReadError, match=str(LARGEST_FILE)):
+        await autopilot.reader.read("etc/a.json")
+    assert 5 not in [payload[6] for _, payload in autopilot.asked]  # the opcode of a read
+
+
 class Link:
     """A report reader whose autopilot accepts every command and has no metadata."""
 
