@@ -368,11 +368,12 @@ def test_an_unknown_distortion_model_is_rejected(name: str) -> None:
             SharedFrameReader(name)
 
 
-def test_a_damaged_calibration_is_rejected(name: str) -> None:
-    calibration = CameraCalibration(CameraModel.from_horizontal_fov(16, 12, 1.2))
+@pytest.mark.parametrize("word", [13, 17, 25, 30])  # of the lens, its distortion, the mount's place and turn
+def test_a_damaged_calibration_is_rejected(name: str, word: int) -> None:
+    calibration = CameraCalibration(CameraModel.from_horizontal_fov(16, 12, 1.2), CameraMount())
     with SharedFrameWriter(name, 16, 12, depth=False, calibration=calibration):
         with segment_path(name).open("r+b") as file:
-            file.seek(13 * 8)
+            file.seek(word * 8)
             file.write(np.array([np.nan]).tobytes())
         with pytest.raises(ValueError, match="damaged"):
             SharedFrameReader(name)
