@@ -19,7 +19,7 @@ from typing_extensions import TypedDict
 from companion.bus.client import message_of, open_client, subscribe_kept
 from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
 from companion.peer_data import PeerDataError
-from companion.recording import RecordingError
+from companion.recording import PAUSED, RECORDED, RECORDING, RecordingError
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.scheduling import lower_priority
@@ -33,8 +33,6 @@ _POLL_S = 0.05
 _LAST_S = 0.3
 # A disk with space again, or a folder that has come, is used within this time.
 RETRY_S = 10.0
-# Beginnings of what it says.
-RECORDING, RECORDED, PAUSED = "recording to ", "recorded ", "paused: "
 
 
 class LossesBody(TypedDict):

@@ -18,6 +18,7 @@ from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.perception.cameras import recorded_frames_names
+from companion.recording import LISTENING, RECORDED, RECORDING
 from companion.settings import CameraSection, Settings
 from companion.settings.vehicle import COMPONENT_IDS
 from companion.vehicle.driver import Driver, OnBytes
@@ -27,7 +28,7 @@ from companion.vehicle.signing import read_key
 from companion.vehicle.streamer import Streamer
 
 # Beginnings of the lines that its clients print when all is well.
-_ROUTINE = ("recorder: recording to ", "recorder: recorded ", "foxglove: open ")
+_ROUTINE = (RECORDING, RECORDED, LISTENING)
 # With low priority on a busy computer the recorder takes seconds to finish its file.
 _END_S = {"recorder": 20.0, "foxglove": 5.0}
 
@@ -106,8 +107,15 @@ def limits_of(settings: Settings) -> Limits:
 
 
 @asynccontextmanager
-async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -> AsyncIterator[None]:
-    """Run meanwhile the clients that are set: the recorder, and Foxglove live."""
+async def clients_of(
+    settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str], None]
+) -> AsyncIterator[None]:
+    """Run meanwhile the clients that are set: the recorder, and Foxglove live.
+
+    Args:
+        on_event: called with (level, text). on_state: called with a client's name and why it does not work;
+            empty: it does.
+    """
     programs: dict[str, dict[str, Any]] = {}
     if settings.recording.directory:
         limits = {"max_file_mb", "max_file_minutes", "max_total_mb"}
@@ -120,14 +128,18 @@ async def clients_of(settings: Settings, on_event: Callable[[str, str], None]) -
         programs["foxglove"] = settings.foxglove.model_dump()
 
     def say(line: str) -> None:
-        on_event("info" if line.startswith(_ROUTINE) else "warning", line)
+        name, _, text = line.partition(": ")
+        well = text.startswith(_ROUTINE)
+        on_event("info" if well else "warning", line)
+        on_state(name, "" if well else text)
 
     async with AsyncExitStack() as stack:
         for name, options in programs.items():
+            on_state(name, "it is starting")
             try:
                 zenoh = settings_for_child(settings.zenoh)
             except (NoAnswerError, BusError) as error:
-                on_event("warning", f"{name}: {error}")
+                say(f"{name}: {error}")
                 continue
             argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
             program = child_process(name, "companion.recording", argument, say, end_s=_END_S[name])

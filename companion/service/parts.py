@@ -1,4 +1,4 @@
-"""The parts that come from outside and may be missing: autopilot, cameras, zenoh. The service starts without.
+"""The parts that may be missing: autopilot, cameras, zenoh, its own clients. The service starts without.
 
 Each has a state with a reason, for `status`, the page and the answers to commands, and none is given up.
 """
@@ -56,7 +56,7 @@ class Part:
     """What is known of a part. Times are CLOCK_MONOTONIC nanoseconds.
 
     Attributes:
-        name: autopilot, zenoh, camera, or `camera NAME`.
+        name: autopilot, zenoh, camera, `camera NAME`, recorder or foxglove.
         reason: why it is not ready; empty: it is, or it is not known yet.
         since_ns: begin of the state. next_try_ns: None: it is tried all the time, or needs no try.
     """
@@ -100,7 +100,12 @@ class Parts:
         self._has_vehicle = settings.expected
         self._link = Part(AUTOPILOT, PartState.STARTING)
         self._since: dict[str, Part] = {}
+        self._clients: dict[str, Part] = {}
         self._been_up: set[str] = set()
+
+    def on_client(self, name: str, problem: str) -> None:
+        """Note why a client that the service runs does not work; empty: it does."""
+        self._clients[name] = Part(name, PartState.RETRYING if problem else PartState.READY, problem)
 
     def now(self, now_ns: int) -> tuple[Part, ...]:
         """Return all parts, the autopilot first."""
@@ -108,6 +113,7 @@ class Parts:
         parts += [_of_camera(camera) for camera in self._cameras]
         missing = self._bus.missing
         parts.append(Part(ZENOH, PartState.MISSING if missing else PartState.READY, missing))
+        parts += self._clients.values()
         for index, part in enumerate(parts):
             before = self._since.get(part.name)
             since_ns = before.since_ns if before is not None and before.state is part.state else now_ns
@@ -200,7 +206,7 @@ class Parts:
             LinkError, PerceptionStartError: with `within_s`, for autopilot and cameras.
         """
         deadline_s = None if within_s is None else time.monotonic() + within_s
-        others = (ZENOH,) if autopilot else (ZENOH, AUTOPILOT)
+        others = {ZENOH, *self._clients} | (set() if autopilot else {AUTOPILOT})
         while waiting := [
             part
             for part in self.now(time.monotonic_ns())
@@ -216,7 +222,8 @@ class Parts:
 
     async def _announce(self) -> None:
         await self.complete()
-        names = [part.name for part in self.now(time.monotonic_ns()) if part.name != ZENOH]
+        others = {ZENOH, *self._clients}
+        names = [part.name for part in self.now(time.monotonic_ns()) if part.name not in others]
         if names:
             self._on_event("info", f"up: {', '.join(names)}")
 

@@ -130,7 +130,7 @@ class Service:
             PerceptionStartError: wrong settings, see `PerceptionSupervisor.start`; never while armed.
             BusError: zenoh cannot listen. MetricsError: no library, or its address is not available.
         """
-        async with clients_of(self.settings, self._event):
+        async with clients_of(self.settings, self._event, self.parts.on_client):
             self._tap.start()
             await self._run(ready)
 

@@ -125,7 +125,7 @@ async def test_unusable_file_of_the_children_is_named(tmp_path: Path, name: str,
     lines: list[str] = []
     async with (
         dashboard_process(settings, lines.append),
-        clients_of(settings, lambda _level, line: lines.append(line)),
+        clients_of(settings, lambda _level, line: lines.append(line), lambda *state: None),
     ):
         pass
     assert [line.partition(f" {path}: ")[0] for line in lines] == [
@@ -157,7 +157,7 @@ async def test_dashboard_and_recorder_connect_with_the_childrens_file() -> None:
     try:
         async with (
             dashboard_process(settings, lines.put_nowait),
-            clients_of(settings, lambda _level, line: lines.put_nowait(line)),
+            clients_of(settings, lambda _level, line: lines.put_nowait(line), lambda *state: None),
             asyncio.timeout(60.0),
         ):
             begun = sorted([await lines.get(), await lines.get()])

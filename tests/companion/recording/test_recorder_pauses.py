@@ -11,10 +11,10 @@ from threading import Event
 import pytest
 import zenoh
 
-from companion.recording import RecordingError, recorder
+from companion.recording import PAUSED, RECORDED, RECORDING, RecordingError, recorder
 from companion.recording import files as recording_files
 from companion.recording.files import KEPT_FREE_BYTES, RecordingReader
-from companion.recording.recorder import PAUSED, RECORDED, RECORDING, RecorderOptions, record
+from companion.recording.recorder import RecorderOptions, record
 from companion.settings import ZenohSection
 from tests.companion.recording.lockstep_recording import new_writer
 

@@ -235,3 +235,18 @@ def test_part_absent_for_ten_minutes(
                 await until(lambda: states(service)[absent] == "ready", 45.0)
 
     run_simulated(monkeypatch, clock, work())
+
+
+async def test_recorder_is_a_part_that_waits_for_its_folder(tmp_path: Path) -> None:
+    """And nothing else waits for it."""
+    (tmp_path / "recordings").write_text("no folder")
+    service = service_of(vehicle__url="none", recording__directory=str(tmp_path / "recordings"))
+    async with running(service):
+        await service.parts.complete(1.0)
+        await until(lambda: "paused" in reason(service, "recorder"))
+        assert states(service)["recorder"] == "retrying"
+        assert str(tmp_path / "recordings") in service.parts.missing_text()
+        (tmp_path / "recordings").unlink()
+        await until(lambda: states(service)["recorder"] == "ready")
+        assert list((tmp_path / "recordings").glob("*.mcap"))
+    assert states(service)["recorder"] == "ready"
