@@ -224,7 +224,9 @@ def observed(
 
 # --- the documents -----------------------------------------------------------------------------------
 
-_ROW = re.compile(r"\| `?(?P<act>\d)`? [^|]*\| (?P<old>[^|]+) \| (?P<new>[^|]+) \| (?P<pilot>[^|]+) \|")
+_ROW = re.compile(
+    r"^\| `?(?P<act>\d)`? [^|]*\| (?P<old>[^|]+) \| (?P<new>[^|]+) \| (?P<pilot>[^|]+) \|", re.MULTILINE
+)
 
 
 def test_table_of_the_docs_is_the_functions() -> None:

@@ -112,7 +112,7 @@ class CopterClient:
     def __init__(self) -> None:
         self.copter = LockstepVehicle(autopilot="ardupilot", seed=1, ready_after_s=0.0)
         self.profile = ArduPilotProfile()
-        self.monitor = StreamMonitor(self.profile.rates_hz, 0)
+        self.monitor = StreamMonitor(self.profile.rates_hz, 0, once=self.profile.once)
         self.loses_requests = False
 
     def run(self, seconds: float) -> None:
@@ -140,6 +140,7 @@ class CopterClient:
                             0,
                         )
                     )
+                    self.monitor.answered(message_id, accepted=True)
 
 
 def test_copter_sends_all_streams_after_lost_requests() -> None:
