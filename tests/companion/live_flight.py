@@ -80,7 +80,8 @@ class LiveFlight:
     async def running(self) -> AsyncIterator[None]:
         unsubscribe = self.driver.subscribe(self.inputs.on_state)
         await self.driver.connect(20.0)
-        tasks = [asyncio.create_task(self.loop.run()), asyncio.create_task(self.streamer.run())]
+        runs = (self.loop.run(), self.streamer.run(), self._health.run())
+        tasks = [asyncio.create_task(run) for run in runs]
         try:
             yield
         finally:
