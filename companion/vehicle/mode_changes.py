@@ -100,6 +100,11 @@ class ModeChange:
         """Whether a report shows the wanted mode or arming."""
         return state.custom_mode == self.mode if self.armed is None else state.armed is self.armed
 
+    @property
+    def arrived(self) -> bool:
+        """Whether its effect was seen. In the wanted mode already, only an acknowledgement shows it."""
+        return self.shown and (self.acknowledged_ns is not None or not self.shows(self.before))
+
     def shows_before(self, state: VehicleState) -> bool:
         """Whether a report is the one at the request, or how the autopilot goes on from it by itself."""
         if state.armed is not self.before.armed:
@@ -145,7 +150,7 @@ class ModeChanges:
         if last is not None:
             self.drop(last, f"superseded by {change.what}")
             self._dropped = [(mode, until) for mode, until in self._dropped if now_ns <= until]
-            if not last.shown and last.mode is not None:
+            if not last.arrived and last.mode is not None:
                 self._dropped.append((last.mode, last.sent_ns + IN_FLIGHT_S * 1e9))
         self._newest, self._reported = change, state
         change.begun_ns = now_ns
@@ -195,8 +200,7 @@ class ModeChanges:
             self._on_another(change, state, now_ns)
         elif change.other is None:
             change.shown = True
-            # In that mode already: only the acknowledgement shows that the message has arrived.
-            if change.acknowledged_ns is not None or not change.shows(change.before):
+            if change.arrived:
                 self._end(change, Ending.DONE)
         elif last is not None and not change.shows(last):
             if change.arrived_since:

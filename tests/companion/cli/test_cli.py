@@ -26,7 +26,7 @@ from companion.guidance.command import COMMANDS
 from companion.settings import Settings
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
-from vision.catalog import KNOWN
+from vision.catalog import CAMERA_MODEL, KNOWN
 from vision.object_detector import YOLO
 from vision.weights import DEFAULT_WEIGHTS
 
@@ -347,8 +347,9 @@ def test_detect_warns_of_a_model_of_rendered_scenes(
     }[name]
     done = companion_here("detect", image_folder, "--limit", "2", "--model", model, *flags, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if "models pull" in line]
-    offered = KNOWN[line.rpartition("--model ")[2]]
+    (line,) = [line for line in done.stderr.splitlines() if "--pull" in line]
+    offered = KNOWN[CAMERA_MODEL]
+    assert offered.name in line
     assert (offered.licence, Path(offered.file).suffix) == ("Apache-2.0", ".onnx")  # needs no extra
     assert f"'{model}'" in line
     assert "camera images" in line
@@ -361,7 +362,7 @@ def test_detect_is_silent_about_another_model(small_model: Path, image_folder: P
     save_checkpoint(own, load_checkpoint(small_model).model, metadata={"trained_on": "6 images of set"})
     done = companion_here("detect", image_folder, "--model", own, "--image-size", "96", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "models pull" not in done.stderr
+    assert "--pull" not in done.stderr
 
 
 def test_no_warning_for_the_simulated_camera(capsys: pytest.CaptureFixture[str]) -> None:

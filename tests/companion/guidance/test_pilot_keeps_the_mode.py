@@ -242,3 +242,8 @@ def test_last_mode_is_the_pilots_at_each_moment(sender: str, fault: str, autopil
     if (sender, autopilot) == ("yield", "ardupilot"):
         pytest.skip("ArduPilot's fence does not hold and keep the mode that was intended")
     assert overridden(sender, fault, moments(sender, fault, EVERY_S), autopilot) == []
+
+
+def test_late_request_for_the_present_mode_is_not_the_pilots() -> None:
+    """Copter is in GUIDED when GUIDED is requested: its report does not show that the message has arrived."""
+    assert overridden("shutdown-engaging", "delay 0.3", [0.0, 0.1], "ardupilot") == []

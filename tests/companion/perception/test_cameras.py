@@ -63,7 +63,7 @@ def test_two_models_on_one_camera_and_the_second_steers(
         service.wait_for_line("camera down: perception lost")
         service.wait_for_line("camera down: perception restored")
         # Both cameras have the model of rendered scenes, and read frames that are not the simulator's.
-        (line,) = [line for line in service.lines if "models pull" in line]
+        (line,) = [line for line in service.lines if "add --pull" in line]
         assert "'small.onnx'" in line.replace(str(exported_model), "small.onnx")
         while not received.empty():
             received.get()
