@@ -92,7 +92,7 @@ def annotate(
     Args:
         image: (height, width, 3) uint8, BGR. Lines and letters scale with its size.
         detections: each gets a box in its class's colour and a label: name, track and range where known,
-            confidence. A label covers no other one; where there is no room for it, it is left out.
+            confidence. A label covers no other one; where there is no space for it, it is left out.
         lines: text for a panel at the top left.
         highlight: index of the detection to highlight: drawn last, tinted, with bracketed corners.
         centre_m: depth at the image's centre, metres, drawn beside a red point there; NaN: unknown; None: no
@@ -225,7 +225,7 @@ def _draw_label(
     sizes: _Sizes,
     occupied: list[Rectangle],
 ) -> None:
-    """Draw a label where there is room, and note its place in `occupied`."""
+    """Draw a label where there is space, and note its place in `occupied`."""
     class_id = int(detections.class_id[index])
     text = f"{detections.class_names[class_id]}{_identity(detections, index)} "
     text += f"{float(detections.confidence[index]):.2f}"

@@ -13,7 +13,7 @@ MOST_LABELS = 60
 def place_label(
     box: Rectangle, size: tuple[int, int], image_size: tuple[int, int], occupied: Sequence[Rectangle]
 ) -> Rectangle | None:
-    """Return where to draw the label of a box, near it and clear of what is occupied; None: there is no room.
+    """Return where to draw the label of a box, near it and clear of what is occupied; None: no space is left.
 
     Above the box, inside, below, and else the nearest free place. One that covers a small box is chosen
     last of those.

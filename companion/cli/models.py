@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import plain_errors
+from companion.cli.flags import EXIT_BAD_INPUT, EXIT_PASSING, plain_errors
 
 if TYPE_CHECKING:
     from companion.models.pull import Pulled
@@ -109,8 +109,10 @@ def pull(
     )
 
 
-def pull_named(name: str, folder: Path | None = None, url: str | None = None) -> Pulled:
-    """Download an official model, as `companion models pull`. Exits with code 2 if that fails."""
+def pull_named(
+    name: str, folder: Path | None = None, url: str | None = None, *, failed: int = EXIT_BAD_INPUT
+) -> Pulled:
+    """Download an official model, as `companion models pull`. Exits with code `failed` if that fails."""
     import difflib
 
     from companion.models.pull import PullError, at_address
@@ -124,7 +126,7 @@ def pull_named(name: str, folder: Path | None = None, url: str | None = None) ->
         typer.echo(f"companion: unknown official model {name!r}; nearest: {', '.join(nearest)}", err=True)
         raise typer.Exit(2)
     typer.echo(f"{known.name}: {LICENCE_NOTES[known.licence]}", err=True)
-    with plain_errors(PullError), _DownloadBar(known.file) as progress:
+    with plain_errors(PullError, code=failed), _DownloadBar(known.file) as progress:
         return download(
             known if url is None else at_address(known, url), folder or models_folder(), progress=progress
         )
@@ -145,7 +147,7 @@ def model_after_pull(model: str, sources: Iterable[str]) -> str:
             return model
         model = CAMERA_MODEL
     if not find_model(model).exists():
-        pull_named(model)
+        pull_named(model, failed=EXIT_PASSING)  # the network may be there at the next start
     return model
 
 

@@ -1,4 +1,4 @@
-"""Labels of boxes: none covers another, and each has a place as long as there is room."""
+"""Labels of boxes: none covers another, and each has a place as long as there is space."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ const MOST_LABELS = 60; // the search for a free place grows with their number s
 const overlap = (one, other) => Math.max(0, Math.min(one[2], other[2]) - Math.max(one[0], other[0]))
   * Math.max(0, Math.min(one[3], other[3]) - Math.max(one[1], other[1]));
 
-// Returns where to draw a label of a size, near its box and clear of what is occupied; null: there is no room.
+// Returns where to draw a label of a size, near its box and clear of what is occupied; null: there is no space.
 export function placeLabel(box, [width, height], [imageWidth, imageHeight], occupied) {
   if (width > imageWidth || height > imageHeight || occupied.length >= MOST_LABELS) return null;
   const at = (x, y) => [x, y, x + width, y + height];

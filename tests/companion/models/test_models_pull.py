@@ -14,6 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
+from companion.cli.flags import EXIT_BAD_INPUT, EXIT_PASSING
 from companion.cli.models import model_after_pull
 from companion.models.pull import PullError, at_address, pull
 from vision.catalog import CAMERA_MODEL, KNOWN, KnownModel, known_by_digest
@@ -241,5 +242,15 @@ def test_pull_chooses_the_model_by_the_sources(
 ) -> None:
     monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path))
     pulled: list[str] = []
-    monkeypatch.setattr("companion.cli.models.pull_named", pulled.append)
+    monkeypatch.setattr("companion.cli.models.pull_named", lambda name, **_: pulled.append(name))
     assert (model_after_pull(model, sources), pulled) == (used, downloaded)
+
+
+def test_pull_without_network_may_succeed_at_another_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path))
+    monkeypatch.setitem(KNOWN, CAMERA_MODEL, at_address(KNOWN[CAMERA_MODEL], "http://127.0.0.1:1/model.pt"))
+    for command in (["detect", IMAGE], ["view", IMAGE], ["run", "--source", IMAGE]):
+        assert CliRunner().invoke(app, [*command, "--pull"]).exit_code == EXIT_PASSING
+    assert CliRunner().invoke(app, ["models", "pull", CAMERA_MODEL]).exit_code == EXIT_BAD_INPUT
