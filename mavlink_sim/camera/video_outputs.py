@@ -26,6 +26,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.util import find_spec
 from typing import Any, Protocol
 from urllib.parse import urlsplit
 
@@ -47,18 +48,15 @@ class RtpOutput:
 
     Raises (when made):
         ValueError: a size that H.264 with subsampled colour does not support.
-        ModuleNotFoundError: PyAV is not installed, or it has no H.264 encoder.
+        ModuleNotFoundError: PyAV is not installed (`check_output` says what to install), or it has no H.264
+            encoder.
     """
 
     def __init__(self, host: str, port: int, width: int, height: int, rate_hz: float) -> None:
         if width % 2 or height % 2:
             raise ValueError(f"H.264 needs even sides, got {width}x{height}")
-        try:
-            import av
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                f"sending H.264 needs PyAV: {install_command('av')}", name="av"
-            ) from error
+        import av
+
         if "libx264" not in av.codecs_available:
             raise ModuleNotFoundError(
                 "this PyAV was built without libx264, which encodes the stream", name="av"
@@ -406,7 +404,7 @@ class FrameOutput(Protocol):
 
 
 def check_output(address: str) -> None:
-    """Raise ValueError for an address that `open_output` does not support."""
+    """Raise ValueError for an address that `open_output` does not support, or not as installed."""
     parts = urlsplit(address)
     if parts.scheme == "shm":
         segment_path(parts.netloc + parts.path)
@@ -415,6 +413,9 @@ def check_output(address: str) -> None:
             raise ValueError(f"output {address!r}: expected pipe:PATH of a FIFO or pipe:- (standard output)")
     elif parts.scheme in ("http", "rtp"):
         _host_and_port(address)
+        # Before a camera's process starts: the vehicle would fly on without its camera.
+        if parts.scheme == "rtp" and find_spec("av") is None:
+            raise ValueError(f"output {address!r}: H.264 needs PyAV: {install_command('av')}")
     else:
         raise ValueError(f"output {address!r}: expected one of {', '.join(SCHEMES)}")
 
@@ -449,9 +450,9 @@ def open_output(
         calibration: the camera's lens and mount; only shared memory transports them.
 
     Raises:
-        ValueError: an invalid address.
+        ValueError: an invalid address, or RTP without the package that encodes it.
         OSError: a port or name that is taken.
-        ModuleNotFoundError: RTP without the package that encodes it.
+        ModuleNotFoundError: that package has no H.264 encoder.
     """
     check_output(address)
     parts = urlsplit(address)

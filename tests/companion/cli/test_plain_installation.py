@@ -16,6 +16,7 @@ import pytest
 import typer.main
 
 from companion.cli import app
+from mavlink_sim.cli.main import _COMMANDS as SIMULATOR_COMMANDS
 from tests.companion.plain_installation import environment_without
 from vision.extras import EXTRA_OF, install_command, missing_module
 
@@ -46,8 +47,14 @@ OPTIONAL = {
 NOBODY = ("--connect", "tcp/127.0.0.1:1")  # where no service answers
 ENDS = ""  # ends, with output or one line of its own
 # (command, arguments, extra that its one line names). A command may be in it several times.
-WALK: list[tuple[str, tuple[str, ...], str]] = [
+Walk = list[tuple[str, tuple[str, ...], str]]
+NO_VEHICLE = ("--vehicle-url", "none", "--zenoh-listen", "tcp/127.0.0.1:0")
+WALK: Walk = [
     ("run", ("--vehicle-url", "bad"), ENDS),
+    ("run", (*NO_VEHICLE, "--source", "demo.png", "--model", "old.pt"), "torch"),
+    ("run", (*NO_VEHICLE, "--source", "demo.png", "--detector-runtime", "torch"), "torch"),
+    ("run", (*NO_VEHICLE, "--source", "demo.png", "--detector-runtime", "openvino"), "openvino"),
+    ("run", (*NO_VEHICLE, "--source", "none", "--metrics-listen", "127.0.0.1:1"), "metrics"),
     ("play", ("--autopilot", "none"), ENDS),
     ("view", ("none",), ENDS),
     ("demo", ("--seeds", "2..1"), ENDS),
@@ -77,7 +84,7 @@ WALK: list[tuple[str, tuple[str, ...], str]] = [
     ("collect", ("images", "flight.mcap"), "recording"),
     ("evaluate", ("labelled", "--image-size", "320"), ENDS),
     ("evaluate", ("labelled", "--runtime", "torch"), "torch"),
-    ("train", ("--data", "labelled"), "torch"),
+    ("train", ("--data", "labelled", "--steps", "2", "--image-size", "64"), "torch"),
     ("train-policy", ("companion/CartPole-v0",), "rl"),
     ("models list", (), ENDS),
     ("models info", ("default",), ENDS),
@@ -101,11 +108,18 @@ WALK: list[tuple[str, tuple[str, ...], str]] = [
     ("log tlog", ("flight.mcap", "out.tlog"), "recording"),
     ("log ulog", ("flight.mcap", "flight.ulg", "--output", "out.mcap"), "recording"),
 ]
+SIMULATOR_WALK: Walk = [
+    ("", ("--camera-output", "rtp://127.0.0.1:5600"), "video"),
+    ("camera", ("--vehicle-url", "udpin://127.0.0.1:0", "--camera-output", "rtp://127.0.0.1:5600"), "video"),
+    ("dataset", ("images", "--frames", "2"), ENDS),
+    ("board", ("--help",), ENDS),
+    ("bench", ("--help",), ENDS),
+]
 # All in one process, to which each command's imports are new only once.
 CHILD = """
-import json, sys
+import importlib, json, sys
 from typer.testing import CliRunner
-from companion.cli.commands import app
+app = importlib.import_module(sys.argv[2]).app
 for arguments in json.loads(sys.argv[1]):
     done = CliRunner().invoke(app, arguments)
     failed = None if isinstance(done.exception, SystemExit | None) else repr(done.exception)
@@ -122,7 +136,7 @@ def commands(command: Any, name: str = "") -> Iterator[str]:
         yield from commands(part, f"{name} {word}".strip())
 
 
-def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tuple[str, ...], str]]) -> Any:
+def walked(folder: Path, environment: dict[str, str], walk: Walk, module: str) -> Any:
     """Run the commands in a folder with an image, a checkpoint, a recording and a labelled set.
 
     What is run is a copy of the packages: nothing may be written into it.
@@ -135,12 +149,12 @@ def walked(folder: Path, environment: dict[str, str], walk: list[tuple[str, tupl
     (folder / "labelled").mkdir()
     shutil.copy(ROOT / "docs/images/demo.png", folder / "labelled")
     (folder / "labelled" / "demo.txt").write_text("2 0.5 0.5 0.2 0.2\n")
-    for name in ("old.pt", "flight.mcap"):
-        (folder / name).touch()
+    (folder / "old.pt").write_bytes(b"PK")  # begins as a checkpoint
+    (folder / "flight.mcap").touch()
     given = json.dumps([[*command.split(), *arguments] for command, arguments, _ in walk])
     path = os.pathsep.join((environment["PYTHONPATH"], str(packages)))
     done = subprocess.run(
-        [sys.executable, "-c", CHILD, given],
+        [sys.executable, "-c", CHILD, given, module],
         cwd=folder,
         env=environment | {"PYTHONPATH": path, "PYTHONDONTWRITEBYTECODE": "1"},
         stdin=subprocess.DEVNULL,
@@ -161,14 +175,18 @@ def files(folder: Path) -> dict[Path, int]:
 
 def test_walk_has_every_command() -> None:
     assert {command for command, _, _ in WALK} == set(commands(typer.main.get_command(app)))
+    assert {command for command, _, _ in SIMULATOR_WALK} == {"", *SIMULATOR_COMMANDS}
 
 
 @pytest.mark.timeout(300)
-def test_every_command_works_or_names_its_extra(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("walk", "module"), [(WALK, "companion.cli.commands"), (SIMULATOR_WALK, "mavlink_sim.cli.main")]
+)
+def test_every_command_works_or_names_its_extra(tmp_path: Path, walk: Walk, module: str) -> None:
     (tmp_path / "work").mkdir()
-    results = walked(tmp_path / "work", environment_without(tmp_path / "hidden"), WALK)
+    results = walked(tmp_path / "work", environment_without(tmp_path / "hidden"), walk, module)
     wrong = []
-    for (command, arguments, extra), (code, output, errors, failed) in zip(WALK, results, strict=True):
+    for (command, arguments, extra), (code, output, errors, failed) in zip(walk, results, strict=True):
         lines = errors.splitlines()
         if extra:
             good = code == 2 and len(lines) == 1 and f"'mavlink-companion[{extra}]'" in errors
