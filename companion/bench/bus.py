@@ -220,6 +220,7 @@ class _Reader:
         self._process.start()
         theirs.close()
         if not await asyncio.to_thread(self.connection.poll, _START_S):
+            await self.__aexit__()  # an open session's threads would keep this process
             raise RuntimeError(f"the subscriber's process did not start within {_START_S:g} s")
         self.connection.recv()
         return self

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +72,23 @@ def test_worker_ends_if_the_next_one_cannot_start(monkeypatch: pytest.MonkeyPatc
         measure_bus(1.0, rate_hz=30.0, load=2)
     with pytest.raises(ProcessLookupError):
         os.kill(started[0].pid, 0)
+
+
+def test_subscriber_that_does_not_start_ends_the_command(tmp_path: Path) -> None:
+    """The process ends, with one line: no thread of an open session keeps it."""
+    program = "from companion.bench import bus; bus._START_S = 0.001; from companion.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", program, "bench", "bus", "--load", "0"],
+        cwd=tmp_path,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert "0.001 s" in done.stderr
 
 
 def test_benchmark_publishes_a_valid_message() -> None:
