@@ -1,0 +1,94 @@
+"""Runs commands of a document as a reader does: one after the other, as printed, in the present folder.
+
+A command that keeps running has a terminal of its own until another of its kind starts or the page ends;
+then it gets a Ctrl-C. `python -m tests.page_commands COMMAND…` prints each that failed.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+
+from tests.companion.service_process import ServiceProcess
+
+# How a command that keeps running starts, its kind (one of a kind runs), what its command line has, and
+# what it prints when the next command can be given ("": anything).
+KEPT = (
+    ("companion play", "service", "", "Ctrl-C ends it"),
+    ("companion run", "service", "shm://", "up: autopilot"),
+    ("companion run", "service", "", "ready: commands on"),
+    ("companion dashboard", "dashboard", "", ""),
+    ("mavlink-sim --", "vehicle", "", ""),
+)
+WATCHED = ("companion echo", "companion markers shm://")  # prints without end
+WATCHED_S = 3.0
+COMMAND_S = 120.0
+ENDED = (0, 128 + signal.SIGINT)
+
+
+def open_terminal(line: str) -> ServiceProcess:
+    return ServiceProcess(
+        subprocess.Popen(
+            ["bash", "-c", line],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            start_new_session=True,
+        ),
+        "",
+    )
+
+
+def interrupt(terminal: ServiceProcess) -> int:
+    """Press Ctrl-C; returns the exit code."""
+    if terminal.process.poll() is None:
+        os.killpg(terminal.pid, signal.SIGINT)
+    return terminal.process.wait(60.0)
+
+
+def failures(lines: Sequence[str]) -> Iterator[str]:
+    """Run the commands in order; yields a report of each that fails."""
+    kept: dict[str, tuple[str, ServiceProcess]] = {}
+
+    def end(kind: str) -> Iterator[str]:
+        if kind in kept:
+            line, terminal = kept.pop(kind)
+            if (code := interrupt(terminal)) not in ENDED:
+                yield report(line, f"exit code {code} after Ctrl-C", terminal)
+
+    for line in lines:
+        for start, kind, part, ready in KEPT:
+            if line.startswith(start) and part in line:
+                yield from end(kind)
+                terminal = open_terminal(line)
+                kept[kind] = line, terminal
+                try:
+                    terminal.wait_for_line(ready, 60.0)
+                except TimeoutError:
+                    yield report(line, "not ready", terminal)
+                break
+        else:
+            terminal = open_terminal(line)
+            watched = line.startswith(WATCHED)
+            try:
+                code = terminal.process.wait(WATCHED_S if watched else COMMAND_S)
+            except subprocess.TimeoutExpired:
+                code = interrupt(terminal)
+                if not watched:
+                    yield report(line, "did not end", terminal)
+            if code not in ENDED:
+                yield report(line, f"exit code {code}", terminal)
+    for kind in list(kept):
+        yield from end(kind)
+
+
+def report(line: str, what: str, terminal: ServiceProcess) -> str:
+    return "\n  ".join([f"{line}: {what}", *terminal.last_lines()[-10:]])
+
+
+if __name__ == "__main__":
+    for failure in failures(sys.argv[1:]):
+        print(failure, flush=True)
