@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import logging
 import queue
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import zenoh
@@ -20,6 +21,7 @@ from companion.bus.topics import (
     INPUT_TOPICS,
     LARGEST_JSON_BYTES,
     ROOT,
+    STATUS,
     TOPICS,
     Topic,
     alive_key,
@@ -31,6 +33,10 @@ from companion.settings import ZenohSection
 _DISCOVERY_S = 2.0
 # After the service has gone its last answer may still arrive.
 _LAST_ANSWER_S = 0.3
+# `status` comes once a second. A service without it this long does not answer.
+SILENT_S = 4.0
+
+logger = logging.getLogger(__name__)
 
 
 class NoAnswerError(TimeoutError):
@@ -114,16 +120,72 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
         time.sleep(0.1)
 
 
+class LastStatus:
+    """What a service has said last about its vehicle, for the time when it says nothing any more."""
+
+    def __init__(self, session: zenoh.Session, vehicle: str) -> None:
+        self._vehicle = vehicle
+        self._newest: tuple[str, float] | None = None  # the sentence, and when it was received
+        self._subscriber = subscribe_kept(session, STATUS.key(vehicle), self._on_status)
+
+    @property
+    def silent_s(self) -> float:
+        """Time since the newest status; 0 before the first."""
+        return 0.0 if self._newest is None else time.monotonic() - self._newest[1]
+
+    def gone_text(self, before: str) -> str:
+        """Return what a service that has gone leaves, and what to do. `before`: what it was to send."""
+        return (
+            f"the service of vehicle {self._vehicle!r} has gone before {before}: it was stopped or killed, "
+            f"or the network was lost. {self._vehicle_text()}"
+        )
+
+    def silent_text(self) -> str:
+        """Return the same of a service that is there and silent."""
+        return (
+            f"the service of vehicle {self._vehicle!r} has been silent for {self.silent_s:.0f} s. "
+            f"{self._vehicle_text()}"
+        )
+
+    def close(self) -> None:
+        """End the subscription."""
+        self._subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+    def _vehicle_text(self) -> str:
+        said = "What the vehicle does now is not known here"
+        if self._newest is not None:
+            said = f"By its last status, {self.silent_s:.0f} s ago: {self._newest[0]}"
+        return (
+            f"{said}. Be ready to take over with the remote control or a ground station. The service's log "
+            "says more: journalctl -u companion"
+        )
+
+    def _on_status(self, sample: zenoh.Sample) -> None:
+        """Runs on a zenoh thread. An older service's status lacks the sentence."""
+        with suppress(PeerDataError, KeyError, TypeError):
+            status = parse_object(copy_payload(sample.payload, STATUS.largest_bytes))
+            self._newest = str(status["vehicle"]["without_service"]), time.monotonic()
+
+
 def send_command(
-    session: zenoh.Session, vehicle: str, text: str, *, timeout_s: float = 120.0
+    session: zenoh.Session,
+    vehicle: str,
+    text: str,
+    *,
+    timeout_s: float = 120.0,
+    on_silent: Callable[[str], None] = logger.warning,
 ) -> dict[str, Any]:
     """Send one command and wait for its result: {"success": bool, "reason": str, ...}.
+
+    Args:
+        on_silent: called once, with a sentence, if the service is there and silent meanwhile.
 
     Raises:
         NoAnswerError: no service for this vehicle, it has gone meanwhile, or no answer within `timeout_s`.
         PeerDataError: the answer cannot be used.
     """
     received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
+    status = LastStatus(session, vehicle)
     # The service's liveliness token shows whether it is there (it may arrive shortly after connecting), and
     # when it has gone: a query to a killed service stays pending until its timeout.
     watching = session.liveliness().declare_subscriber(alive_key(vehicle), received.put, history=True)
@@ -142,8 +204,9 @@ def send_command(
         # The service limits the rate of each sender.
         sender = str(session.zid())
         session.get(command_key(vehicle), replies, payload=text, attachment=sender, timeout=timeout_s)
-        return _answer(received, vehicle, text, timeout_s, deadline_s)
+        return _answer(received, vehicle, text, timeout_s, deadline_s, status, on_silent)
     finally:
+        status.close()
         watching.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -153,38 +216,45 @@ def _answer(
     text: str,
     timeout_s: float,
     deadline_s: float,
+    status: LastStatus,
+    on_silent: Callable[[str], None],
 ) -> dict[str, Any]:
     """Return the first answer to a query. None in the queue: no more replies. `deadline_s`: of the query."""
-    wait_s = timeout_s + _LAST_ANSWER_S
-    ended = gone = False
+    until_s = deadline_s + _LAST_ANSWER_S
+    ended = gone = reported = False
     while True:
+        now_s = time.monotonic()
+        if not reported and not gone and status.silent_s > SILENT_S:
+            reported = True
+            on_silent(f"{text!r}: {status.silent_text()}")
+        # Until the status may be silent, or, before the first one has come, it is looked again.
+        look_s = until_s if reported else min(until_s, now_s + max(SILENT_S - status.silent_s, 0.0) + 0.1)
         try:
-            item = received.get(timeout=wait_s)
+            item = received.get(timeout=max(look_s - now_s, 0.0))
         except queue.Empty:
+            if time.monotonic() < until_s:
+                continue
             item = None
         if isinstance(item, zenoh.Reply) and item.ok is not None:
             return parse_object(copy_payload(item.ok.payload, LARGEST_JSON_BYTES))
+        soon_s = time.monotonic() + _LAST_ANSWER_S
         if _is(item, zenoh.SampleKind.DELETE):
-            wait_s, gone = _LAST_ANSWER_S, True  # an answer may have been sent just before
+            until_s, gone = soon_s, True  # an answer may have been sent just before
         elif _is(item, zenoh.SampleKind.PUT):
-            wait_s, gone = timeout_s + _LAST_ANSWER_S, False  # the network was interrupted
+            until_s, gone = deadline_s + _LAST_ANSWER_S, False  # the network was interrupted
         elif item is None and time.monotonic() >= deadline_s:
             raise NoAnswerError(
                 f"{text!r}: no answer within {timeout_s:g} s; `companion echo status` shows its state"
             )
         elif item is None and not ended and not gone:
-            wait_s, ended = _LAST_ANSWER_S, True  # the token of a killed service may disappear just after
+            until_s, ended = soon_s, True  # the token of a killed service may disappear just after
         elif item is None and not gone:
             raise NoAnswerError(
                 f"{text!r}: refused: zenoh's access control may not allow this client to send commands "
                 f"to vehicle {vehicle!r}"
             )
         elif item is None:
-            raise NoAnswerError(
-                f"{text!r}: the service of vehicle {vehicle!r} has gone before its answer: it was stopped or "
-                "killed, or the network was lost. The autopilot's failsafe applies; check the vehicle and "
-                "the service's log"
-            )
+            raise NoAnswerError(f"{text!r}: {status.gone_text('its answer')}")
 
 
 def _is(item: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:

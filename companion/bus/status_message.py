@@ -27,7 +27,7 @@ from companion.perception.supervisor import PerceptionSupervisor
 from companion.vehicle.autopilot_parameters import AutopilotParameters
 from companion.vehicle.driver import Driver
 from companion.vehicle.gimbal import address_text
-from companion.vehicle.setpoint_loss import setpoint_loss_outcome
+from companion.vehicle.setpoint_loss import setpoint_loss_outcome, without_service_text
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
 
@@ -58,6 +58,7 @@ def status_message(
             same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
     state, limits = driver.state, guidance.limits
+    has_vehicle = any(part["name"] == "autopilot" for part in parts)
     silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
     return {
         "stamp_ns": now_ns,
@@ -84,6 +85,7 @@ def status_message(
                 "warning": silence.warning,
                 "text": silence.text,
             },
+            "without_service": without_service_text(state, parameters, has_vehicle=has_vehicle),
             "missing_streams": list(state.missing_streams),
             "status_texts": [report.text for report in state.reports],
             "other_commanders": others,

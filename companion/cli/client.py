@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, plain_errors
+from companion.cli.flags import EXIT_FAILED, plain_errors, say_silent
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -35,7 +35,9 @@ def send(
     with plain_errors(NoAnswerError, BusError):
         client = client_settings(settings.zenoh, (connect,) if connect else ())
         with open_client(client) as session:
-            reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
+            reply = send_command(
+                session, settings.vehicle.name, command, timeout_s=timeout, on_silent=say_silent
+            )
     typer.echo(reply_text(reply))
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)

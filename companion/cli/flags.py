@@ -121,6 +121,11 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         raise typer.Exit(code) from error
 
 
+def say_silent(text: str) -> None:
+    """Print what is known of a service that is silent in the middle of a command; the command waits on."""
+    typer.echo(f"companion: {text}", err=True)
+
+
 def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:
     """Warn once if a model of rendered scenes may process camera images.
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, YOLO, plain_errors
+from companion.cli.flags import EXIT_FAILED, YOLO, plain_errors, say_silent
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -49,7 +49,9 @@ def mission(
         with open_client(client) as session:
             # The text is sent along: the service may run on another computer.
             command = f"{Mission(file)}\n{text}"
-            reply = send_command(session, settings.vehicle.name, command, timeout_s=timeout)
+            reply = send_command(
+                session, settings.vehicle.name, command, timeout_s=timeout, on_silent=say_silent
+            )
     typer.echo(f"{'done' if reply['success'] else 'failed'}: {reply['reason']}")
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)

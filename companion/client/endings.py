@@ -11,7 +11,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.bodies.service import CommandStateBody
-from companion.bus.client import NoAnswerError, subscribe_kept
+from companion.bus.client import LastStatus, NoAnswerError, subscribe_kept
 from companion.peer_data import PeerDataError, copy_payload, parse_object
 
 _KEPT = 1000
@@ -24,12 +24,11 @@ class Endings:
     """
 
     def __init__(self, session: zenoh.Session, vehicle: str) -> None:
-        self._vehicle, self._loop = vehicle, asyncio.get_running_loop()
+        self._loop = asyncio.get_running_loop()
         self._ended: OrderedDict[str, CommandStateBody] = OrderedDict()
         self._waiting: dict[str, asyncio.Future[CommandStateBody]] = {}
         self._gone = False
-        self._silence = "the autopilot's failsafe applies"
-        self._status = subscribe_kept(session, topics.STATUS.key(vehicle), self._on_status)
+        self._status = LastStatus(session, vehicle)
         self._alive = session.liveliness().declare_subscriber(topics.alive_key(vehicle), self._on_alive)
         self._states = subscribe_kept(session, topics.COMMAND_STATE.key(vehicle), self._on_state)
 
@@ -47,11 +46,7 @@ class Endings:
         return await asyncio.shield(waiting)
 
     def _no_answer(self, identifier: str) -> NoAnswerError:
-        return NoAnswerError(
-            f"command {identifier}: the service of vehicle {self._vehicle!r} has gone before its end: it was "
-            f"stopped or killed, or the network was lost. In offboard mode {self._silence}; be ready to take "
-            "over, and check the service's log"
-        )
+        return NoAnswerError(f"command {identifier}: {self._status.gone_text('its end')}")
 
     # --- in the loop
 
@@ -79,11 +74,6 @@ class Endings:
             body = parse_object(copy_payload(sample.payload, topics.COMMAND_STATE.largest_bytes))
             if body["state"] == "ended" and isinstance(body["id"], str):
                 self._loop.call_soon_threadsafe(self._take, cast(CommandStateBody, body))
-
-    def _on_status(self, sample: zenoh.Sample) -> None:
-        with suppress(PeerDataError, KeyError, TypeError):
-            status = parse_object(copy_payload(sample.payload, topics.STATUS.largest_bytes))
-            self._silence = str(status["vehicle"]["silence"]["text"])
 
     def _on_alive(self, sample: zenoh.Sample) -> None:
         with suppress(RuntimeError):

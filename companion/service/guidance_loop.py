@@ -23,7 +23,7 @@ from companion.service.other_commanders import OtherCommanders
 from companion.service.requests import RequestRunner, apply_output
 from companion.service.slow_updates import SlowUpdates
 from companion.vehicle.driver import CommandRefusedError, Driver, TakenOverError
-from companion.vehicle.setpoint_loss import setpoint_loss_outcome
+from companion.vehicle.setpoint_loss import setpoint_loss_outcome, without_service_text
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer, StreamState
 
@@ -147,6 +147,9 @@ class GuidanceLoop:
                 self._on_event("error", f"shutdown: {error}; {outcome.text}")
             finally:
                 await self.wait_released()
+                if (state := self._driver.state).armed:
+                    now = without_service_text(state, self._inputs.parameters, has_vehicle=True)
+                    self._on_event("warning", f"the service ends, its vehicle is armed: {now}")
 
     async def _leave(self, state: VehicleState, mode: FlightMode | None, *, on_ground: bool) -> None:
         """Disarm on the ground; if that is refused, or in the air, request the mode."""

@@ -45,6 +45,8 @@ from companion.vehicle.driver import Driver
 from companion.vehicle.streamer import Streamer
 from vision.pipeline import PerceptionResult
 
+_LOOK_S = 0.1
+
 logger = logging.getLogger(__package__)
 
 
@@ -182,6 +184,19 @@ class Publisher:
                 camera.supervisor.watch(image, depth=depth, clouds=clouds)
             self._bus.set_alive(_alive(cameras))
             await asyncio.sleep(period_s)
+
+    async def wait_status_due(self) -> None:
+        """Wait until the next `status` is due: its period, or less if the vehicle arms or changes its mode.
+
+        When the service is gone, its clients say what the vehicle does by its last status.
+        """
+        state, due_s = self._driver.state, time.monotonic() + 1 / (topics.STATUS.rate_hz or 1.0)
+        before = state.armed, state.mode
+        while True:
+            await asyncio.sleep(_LOOK_S)
+            state = self._driver.state
+            if time.monotonic() >= due_s or (state.armed, state.mode) != before:
+                return
 
     def _publish_vehicle(self, guidance: Guidance, streamer: Streamer, now_ns: int) -> None:
         bus, state = self._bus, self._driver.state

@@ -220,7 +220,7 @@ class Service:
             self._publisher.publish_cameras(self.cameras)
             mode, behaviour = status["vehicle"]["mode"], status["pilot"]["behaviour"]
             self._notifier.status(self.parts.missing_text() or f"{mode}, {behaviour}")
-            await asyncio.sleep(1 / (topics.STATUS.rate_hz or 1.0))
+            await self._publisher.wait_status_due()
 
     def _on_state(self, state: VehicleState) -> None:
         self.inputs.on_state(state)

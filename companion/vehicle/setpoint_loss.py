@@ -19,7 +19,7 @@ from companion.vehicle.autopilot_parameters import (
     FirmwareVersion,
     ground_station_name,
 )
-from companion.vehicle.state import FlightMode
+from companion.vehicle.state import FlightMode, VehicleState
 
 # A longer flight without setpoints is a warning.
 LONG_S = 2.0
@@ -108,6 +108,25 @@ def setpoint_loss_outcome(read: AutopilotParameters, *, sticks_present: bool) ->
     if read.autopilot == "ArduPilot":
         return _ardupilot(read)
     return _unknown("the autopilot's version and parameters are not read yet")
+
+
+def without_service_text(state: VehicleState, read: AutopilotParameters, *, has_vehicle: bool) -> str:
+    """Return what the vehicle does if the service ends now, as one sentence without a full stop.
+
+    Args:
+        read: firmware version and parameters. has_vehicle: an autopilot is expected (`vehicle.url` is not
+            `none`).
+    """
+    if not has_vehicle:
+        return "there is no vehicle"
+    if state.autopilot is None:
+        return "no autopilot was received"
+    if not state.armed:
+        return "the vehicle was disarmed"
+    if state.mode is FlightMode.OFFBOARD:
+        return setpoint_loss_outcome(read, sticks_present=state.sticks_present).text
+    mode = "an unknown" if state.mode is FlightMode.UNKNOWN else state.mode.value.replace("_", " ")
+    return f"the vehicle was in {mode} mode, which its autopilot flies without the service"
 
 
 def _px4(read: AutopilotParameters, sticks_present: bool) -> SetpointLossOutcome:

@@ -66,6 +66,8 @@ class StatusVehicleBody(TypedDict):
     """what a pilot's sticks do while our setpoints are flown; null until known"""
     silence: StatusSilenceBody
     """without setpoints"""
+    without_service: str
+    """what the vehicle does if the service ends now, one sentence"""
     missing_streams: list[str]
     """required messages that arrive at less than half their rate"""
     status_texts: list[str]

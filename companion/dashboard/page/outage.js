@@ -5,8 +5,8 @@ export const STATUS_STALE_S = 4;
 
 // Returns null, or what has happened, what the vehicle does now, and what to do: { what, vehicle, todo }.
 //   silentS: since the dashboard's newest news. problem: of its connection to zenoh. alive: of the service.
-//   oldS: age of the service's newest state; null: it has none yet. status, vehicle: the newest messages.
-export function outage({ silentS, problem, alive, oldS, status, vehicle }) {
+//   oldS: age of the service's newest state; null: it has none yet. status: the newest message.
+export function outage({ silentS, problem, alive, oldS, status }) {
   if (oldS == null) return null; // nothing is shown that could be stale
   const old = `${oldS.toFixed(0)} s`;
   const cutOff = silentS > STALE_S || Boolean(problem);
@@ -19,18 +19,15 @@ export function outage({ silentS, problem, alive, oldS, status, vehicle }) {
   const todo = cutOff
     ? "Take over with the remote control or a ground station if you must: STOP may not arrive. The page goes on by itself."
     : "Be ready to take over with the remote control or a ground station. The service's log says more: journalctl -u companion.";
-  return { what, vehicle: vehicleText(status || {}, vehicle || {}, cutOff), todo };
+  return { what, vehicle: vehicleText(status || {}, cutOff), todo };
 }
 
-function vehicleText({ parts, vehicle: link, pilot }, { armed, mode }, cutOff) {
-  if (parts && !parts.some((part) => part.name === "autopilot")) return "There is no vehicle.";
-  if (armed === false) return "The vehicle was disarmed.";
-  const silence = link && link.silence ? `${link.silence.text}.` : "what the autopilot does then is not known.";
-  const text = silence[0].toUpperCase() + silence.slice(1);
-  if (mode !== "offboard") {
-    return `The vehicle was in ${(mode || "an unknown").replaceAll("_", " ")} mode, which its autopilot flies without the service.`;
-  }
-  if (!cutOff) return `The vehicle flew the service's setpoints, which have stopped. ${text}`;
-  const behaviour = pilot && pilot.behaviour ? ` (${pilot.behaviour})` : "";
-  return `The vehicle flies on as commanded${behaviour} if its service still runs. If not: ${silence}`;
+// The sentence is the service's own: vehicle.without_service of its newest status.
+function vehicleText({ vehicle: link, pilot }, cutOff) {
+  const unknown = "what the vehicle does without its service is not known";
+  const text = `${(link && link.without_service) || unknown}.`;
+  const flown = pilot && pilot.in_command;
+  if (!cutOff || !flown) return `${flown ? "The vehicle flew the service's setpoints, which have stopped. " : ""}${text[0].toUpperCase()}${text.slice(1)}`;
+  const behaviour = pilot.behaviour ? ` (${pilot.behaviour})` : "";
+  return `The vehicle flies on as commanded${behaviour} if its service still runs. If not: ${text}`;
 }

@@ -37,11 +37,11 @@ function render() {
 // Without a service nothing here is true any more, and no command but STOP is sent.
 const COMMANDING = "#commands button, #talking button, #menu button, #detections button";
 
-function renderOutage(vehicle, status) {
+function renderOutage(status) {
   const { problem, alive } = state;
   const silentS = (performance.now() - state.at) / 1000;
   const oldS = state.at ? age("status") ?? age("vehicle") : null;
-  state.outage = outage({ silentS, problem, alive, oldS, status, vehicle });
+  state.outage = outage({ silentS, problem, alive, oldS, status });
   const { what = "", vehicle: now = "", todo = "" } = state.outage || {};
   $("outage").hidden = $("off").hidden = !state.outage;
   // Read aloud once, not with each second.

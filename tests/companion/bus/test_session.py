@@ -281,6 +281,7 @@ def _serve(endpoint: str, ready: Connection) -> None:
 
         bus = Bus(ZenohSection(listen=(endpoint,)), "alpha", on_event=Events(), on_command=think)
         await bus.start()
+        bus.publish(topics.STATUS, {"vehicle": {"without_service": "PX4 holds its position"}})
         ready.send("up")
         await asyncio.Event().wait()
 
@@ -308,7 +309,7 @@ def test_killed_service_fails_a_pending_command() -> None:
         killer = threading.Thread(target=kill_when_asked)
         with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
             killer.start()
-            with pytest.raises(NoAnswerError, match="has gone"):
+            with pytest.raises(NoAnswerError, match=r"has gone .*PX4 holds its position.*remote control"):
                 send_command(session, "alpha", "orbit", timeout_s=60.0)
         assert time.monotonic() - killed_s < 2.0
         killer.join()
@@ -316,6 +317,39 @@ def test_killed_service_fails_a_pending_command() -> None:
         service.kill()
         service.join()
         ours.close()
+
+
+async def test_silent_service_is_reported_once_and_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its loop hangs: its presence stays, and the command may still be flown."""
+    monkeypatch.setattr("companion.bus.client.SILENT_S", 0.2)
+    settings = ZenohSection(listen=(f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}",))
+    reported = asyncio.Queue[str]()
+    loop = asyncio.get_running_loop()
+
+    async def think(_text: str) -> dict[str, Any]:
+        received.append(await reported.get())
+        await asyncio.sleep(0.5)  # silent on: it is not reported again
+        return {"success": True, "reason": "done"}
+
+    received: list[str] = []
+    bus = Bus(settings, "alpha", on_event=Events(), on_command=think)
+    await bus.start()
+    try:
+        bus.publish(topics.STATUS, {"vehicle": {"without_service": "PX4 holds its position"}})
+
+        def other_side() -> dict[str, Any]:
+            with open_client(client_settings(settings)) as session:
+
+                def report(text: str) -> None:
+                    loop.call_soon_threadsafe(reported.put_nowait, text)
+
+                return send_command(session, "alpha", "orbit", timeout_s=WAIT_S, on_silent=report)
+
+        assert (await asyncio.to_thread(other_side))["success"]
+    finally:
+        await bus.close()
+    assert reported.empty()
+    assert "PX4 holds its position" in received[0]
 
 
 async def test_unknown_vehicle_has_no_service() -> None:

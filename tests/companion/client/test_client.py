@@ -343,7 +343,7 @@ async def test_end_of_an_endless_command_has_its_reason(late: bool) -> None:
 @pytest.mark.realtime
 async def test_waiting_for_an_end_fails_with_the_service() -> None:
     async with connected() as (there, drone):
-        there.bus.publish(topics.STATUS, {"vehicle": {"silence": {"text": "PX4 holds its position"}}})
+        there.bus.publish(topics.STATUS, {"vehicle": {"without_service": "PX4 holds its position"}})
         reply = await drone.takeoff(3)
         waiting = [asyncio.create_task(drone.ended(reply)) for _ in range(2)]
         await anext(drone.status())

@@ -10,14 +10,16 @@ from tests.companion.dashboard.page_module import NODE, evaluate
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH")
 
-SILENCE = {"text": "without setpoints PX4 holds its position after 1.1 s"}
+SILENCE = "without setpoints PX4 holds its position after 1.1 s"
 KNOWN = {
     "silentS": 0.1,
     "problem": "",
     "alive": True,
     "oldS": 1.0,
-    "status": {"vehicle": {"silence": SILENCE}, "pilot": {"behaviour": "orbiting"}},
-    "vehicle": {"armed": True, "mode": "offboard"},
+    "status": {
+        "vehicle": {"without_service": SILENCE},
+        "pilot": {"behaviour": "orbiting", "in_command": True},
+    },
 }
 GONE = {"alive": False, "oldS": 7.0}
 
@@ -30,7 +32,7 @@ def said(**changed: Any) -> dict[str, str] | None:
 def test_nothing_is_said_while_the_service_answers() -> None:
     assert said() is None
     assert said(alive=None, oldS=3.9) is None
-    assert said(alive=False, oldS=None, status=None, vehicle=None) is None
+    assert said(alive=False, oldS=None, status=None) is None
 
 
 @pytest.mark.parametrize(
@@ -51,22 +53,14 @@ def test_outage_says_what_happened_and_how_old_it_is(changed: dict[str, Any], wo
 
 
 @pytest.mark.parametrize(
-    ("vehicle", "words", "absent"),
-    [
-        ({"armed": True, "mode": "offboard"}, ("stopped", "holds its position"), ()),
-        ({"armed": True, "mode": "hold"}, ("hold mode",), ("setpoints",)),
-        ({"armed": True, "mode": "precision_land"}, ("precision land mode",), ("setpoints",)),
-        ({"armed": False, "mode": "offboard"}, ("disarmed",), ("setpoints",)),
-        (None, ("mode",), ("setpoints",)),
-    ],
+    ("in_command", "sentence"), [(True, SILENCE), (False, "the vehicle was disarmed"), (False, None)]
 )
-def test_what_the_vehicle_does_follows_from_its_last_mode(
-    vehicle: dict[str, Any] | None, words: tuple[str, ...], absent: tuple[str, ...]
-) -> None:
-    lines = said(**GONE, vehicle=vehicle)
+def test_outage_has_the_sentence_of_the_last_status(in_command: bool, sentence: str | None) -> None:
+    vehicle = {} if sentence is None else {"without_service": sentence}
+    lines = said(**GONE, status={"vehicle": vehicle, "pilot": {"in_command": in_command}})
     assert lines is not None
-    assert [word for word in words if word not in lines["vehicle"]] == []
-    assert [word for word in absent if word in lines["vehicle"]] == []
+    assert (sentence or "not known")[1:] in lines["vehicle"]
+    assert ("have stopped" in lines["vehicle"]) == in_command
 
 
 def test_lost_connection_is_not_taken_for_a_lost_service() -> None:
@@ -74,13 +68,4 @@ def test_lost_connection_is_not_taken_for_a_lost_service() -> None:
     assert lines is not None
     assert "if its service still runs" in lines["vehicle"]
     assert "orbiting" in lines["vehicle"]
-    assert SILENCE["text"] in lines["vehicle"]
-
-
-def test_outage_without_a_vehicle_or_its_failsafe_says_so() -> None:
-    lines = said(**GONE, status={"parts": [{"name": "camera"}]})
-    assert lines is not None
-    assert "no vehicle" in lines["vehicle"]
-    lines = said(**GONE, status={"vehicle": {}})
-    assert lines is not None
-    assert "not known" in lines["vehicle"]
+    assert SILENCE in lines["vehicle"]

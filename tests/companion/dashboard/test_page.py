@@ -542,7 +542,7 @@ SEEN = {
 }  # fmt: skip
 NOT_HEALTHY = {
     "service": "s", "stamp_ns": 1, "healthy": False, "unhealthy": ["camera: no result for 3.1 s"],
-    "vehicle": {"autopilot": "PX4", "silence": {"text": "without setpoints PX4 holds its position"}},
+    "vehicle": {"autopilot": "PX4", "without_service": "without setpoints PX4 holds its position"},
     "parts": [{"name": "autopilot", "state": "ready", "reason": "", "next_try_ns": None}],
     "pilot": {"mission": MISSION, "behaviour": "holding"}, "limits": {}, "gimbal": None,
     "perception": {"state": "running", "class_names": ["person", "car"], "rate_hz": 7.0, "problem": ""},

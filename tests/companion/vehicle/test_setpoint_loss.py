@@ -17,8 +17,13 @@ from companion.vehicle.autopilot_parameters import (
     parameter_names,
 )
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.setpoint_loss import SetpointLossEffect, SetpointLossOutcome, setpoint_loss_outcome
-from companion.vehicle.state import FlightMode
+from companion.vehicle.setpoint_loss import (
+    SetpointLossEffect,
+    SetpointLossOutcome,
+    setpoint_loss_outcome,
+    without_service_text,
+)
+from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.releases import RELEASES
@@ -243,3 +248,27 @@ def test_table_of_the_docs_is_the_functions() -> None:
                     row[key].split()[0].strip(",:")
                     == outcome(release, sticks=sticks, COM_OBL_RC_ACT=act).effect.value
                 )
+
+
+@pytest.mark.parametrize(
+    ("state", "has_vehicle", "word"),
+    [
+        (VehicleState(), False, "no vehicle"),
+        (VehicleState(), True, "no autopilot"),
+        (VehicleState(autopilot="PX4", mode=FlightMode.OFFBOARD), True, "disarmed"),
+        (VehicleState(autopilot="PX4", armed=True), True, "unknown mode"),
+        (
+            VehicleState(autopilot="PX4", armed=True, mode=FlightMode.PRECISION_LAND),
+            True,
+            "precision land mode",
+        ),
+        (VehicleState(autopilot="PX4", armed=True, mode=FlightMode.OFFBOARD), True, "sinks to the ground"),
+        (
+            VehicleState(autopilot="PX4", armed=True, mode=FlightMode.OFFBOARD, sticks_present=True),
+            True,
+            "flown by the sticks",
+        ),
+    ],
+)
+def test_what_a_vehicle_does_without_the_service(state: VehicleState, has_vehicle: bool, word: str) -> None:
+    assert word in without_service_text(state, px4("1.16.2"), has_vehicle=has_vehicle)

@@ -1,0 +1,28 @@
+"""When the next `status` is due."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from companion.bus import topics
+from companion.service.publisher import Publisher
+from companion.vehicle.state import FlightMode, VehicleState
+
+
+@pytest.mark.parametrize("change", [{"armed": True}, {"mode": FlightMode.OFFBOARD}])
+async def test_status_follows_arming_and_mode_at_once(
+    change: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.service.publisher.topics.STATUS", replace(topics.STATUS, rate_hz=0.01))
+    unused: Any = None
+    driver: Any = SimpleNamespace(state=VehicleState())
+    publisher = Publisher("alpha", unused, driver, unused, unused)
+    due = asyncio.create_task(publisher.wait_status_due())
+    await asyncio.sleep(0)
+    driver.state = replace(driver.state, **change)
+    await asyncio.wait_for(due, 20.0)
