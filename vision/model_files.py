@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vision.catalog import KNOWN
+from vision.home import expanded, home_folder
 
 # Suffixes of model files, in the order in which a bare name is looked up.
 MODEL_SUFFIXES = (".safetensors", ".pt", ".onnx", ".pth")
@@ -23,9 +24,12 @@ def models_folders() -> tuple[Path, ...]:
     both.
     """
     if chosen := os.environ.get("COMPANION_MODELS_FOLDER"):
-        return (Path(chosen).expanduser(),)
-    data = os.environ.get("XDG_DATA_HOME") or "~/.local/share"
-    return (Path(data).expanduser() / "mavlink-companion" / "models", SYSTEM_FOLDER)
+        return (expanded(chosen),)
+    data = os.environ.get("XDG_DATA_HOME")
+    return (
+        (expanded(data) if data else home_folder() / ".local/share") / "mavlink-companion" / "models",
+        SYSTEM_FOLDER,
+    )
 
 
 def models_folder() -> Path:
@@ -52,7 +56,7 @@ def find_model(name: str | Path) -> Path:
 
     A name found nowhere is returned as it is, so that the reader names it in its error.
     """
-    path = Path(name).expanduser()
+    path = expanded(name)
     if path.exists() or path.name != str(name):
         return path
     for folder in models_folders():

@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
@@ -18,6 +17,7 @@ from vision.calibration.camera_info import read_camera_info, read_registration
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion, scaled_to_frames
 from vision.frame import Frame
 from vision.frame_selection import Selection
+from vision.home import expanded
 from vision.marker_boards import Board
 from vision.markers import MarkerKind, PadMarker, markers_in
 from vision.object_detector import YOLO, DetectorSettings
@@ -151,7 +151,7 @@ class CameraSection(Section):
             return values
         if given := sorted(LENS_KEYS & values.keys()):
             raise ValueError(f"calibration_file sets the lens, {', '.join(given)} too: remove one of them")
-        lens = read_camera_info(Path(file).expanduser()).model
+        lens = read_camera_info(expanded(file)).model
         others = {key: value for key, value in values.items() if key != "calibration_file"}
         return others | lens_settings(lens)
 
@@ -258,7 +258,7 @@ def check_calibration_file(values: Any, source: SourceSection, read_uri: str | N
     """
     camera = values.get("camera") if isinstance(values, dict) else None
     if isinstance(camera, dict) and isinstance(file := camera.get("calibration_file"), str):
-        info = read_camera_info(Path(file).expanduser())
+        info = read_camera_info(expanded(file))
         info.check_source(source.opening().orientation, source.name, read_uri or source.uri)
 
 

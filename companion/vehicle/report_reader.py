@@ -34,6 +34,7 @@ from companion.vehicle.framing import (
 )
 from companion.vehicle.report import ALL_MODES, WARNING, Report
 from companion.vehicle.telemetry_state import TelemetryState
+from vision.home import home_folder
 
 logger = logging.getLogger(__name__)
 
@@ -511,4 +512,4 @@ def _matches(crc: int, served: bytes, content: bytes) -> bool:
 def cache_folder() -> Path:
     """Return the folder of cached metadata, in `$XDG_CACHE_HOME` or `~/.cache`."""
     home = os.environ.get("XDG_CACHE_HOME", "")
-    return (Path(home) if home else Path.home() / ".cache") / "companion" / "metadata"
+    return (Path(home) if home else home_folder() / ".cache") / "companion" / "metadata"

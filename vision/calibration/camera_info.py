@@ -12,6 +12,7 @@ import numpy as np
 
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
+from vision.home import expanded
 from vision.orientation import Orientation
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
@@ -190,7 +191,7 @@ def read_registration(file: str, orientation: Orientation) -> DepthCalibration:
     Raises:
         ValueError: as `read_camera_info`, the file has none, or its images are turned otherwise.
     """
-    info = read_camera_info(Path(file).expanduser())
+    info = read_camera_info(expanded(file))
     info.check_source(orientation)
     if info.registration is None:
         raise ValueError(

@@ -13,6 +13,8 @@ import platform
 from pathlib import Path
 from typing import Any
 
+from vision.home import home_folder
+
 logger = logging.getLogger(__name__)
 
 _PATTERN = "trial-*.json"
@@ -21,7 +23,7 @@ _PATTERN = "trial-*.json"
 def cache_folder() -> Path:
     """Folder of converted networks and stored choices: below `$XDG_CACHE_HOME` or `~/.cache`."""
     base = os.environ.get("XDG_CACHE_HOME", "")
-    root = Path(base) if os.path.isabs(base) else Path.home() / ".cache"
+    root = Path(base) if os.path.isabs(base) else home_folder() / ".cache"
     return root / "mavlink-companion" / "runtimes"
 
 

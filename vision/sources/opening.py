@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from vision.calibration.camera_info import read_registration
+from vision.home import expanded
 from vision.registry import shown
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
@@ -103,7 +104,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         check_camera(device, settings)
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     if not scheme:
-        return _open_path(Path(uri).expanduser(), settings)
+        return _open_path(expanded(uri), settings)
     opened = _opener(scheme, name)(uri, settings)
     if not isinstance(opened, Source):
         with contextlib.suppress(Exception):  # a plug-in's own class, or nothing to close
@@ -126,7 +127,7 @@ def check_address(uri: str, settings: SourceSettings) -> None:
     if uri == "-" or camera_device(uri) is not None:
         return
     if scheme in ("", "file"):
-        path = Path(_rest(uri)) if scheme else Path(uri).expanduser()
+        path = Path(_rest(uri)) if scheme else expanded(uri)
         if not os.access(path, os.R_OK):
             raise SourceError(f"{path}: no permission to read it")
         return
@@ -326,7 +327,7 @@ def check_there(uri: str) -> None:
     if (device := camera_device(uri)) is not None:
         check_camera(device, SourceSettings())
     elif uri != "-" and ("://" not in uri or uri.startswith("file://")):
-        _mode(Path(_rest(uri)) if "://" in uri else Path(uri).expanduser())
+        _mode(Path(_rest(uri)) if "://" in uri else expanded(uri))
 
 
 def _mode(path: Path) -> int:
@@ -341,7 +342,7 @@ def _mode(path: Path) -> int:
 
 def _folder(uri: str) -> Path | None:
     """The folder that an address names, None if it names something else."""
-    path = Path(_rest(uri)) if uri.startswith("file://") else Path(uri).expanduser()
+    path = Path(_rest(uri)) if uri.startswith("file://") else expanded(uri)
     return path if path.is_dir() else None
 
 
