@@ -1,4 +1,7 @@
-"""Calibration files: ROS's `camera_info` YAML, as camera_calibration writes and image pipelines read it."""
+"""Calibration files: ROS's `camera_info` YAML, as camera_calibration writes and image pipelines read it.
+
+Those of other programs are read too, see `foreign_files`.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from vision.calibration.lens_names import distortion_name
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
+from vision.file_kinds import explained
 from vision.home import expanded
 from vision.orientation import Orientation
 
@@ -128,19 +133,17 @@ def write_camera_info(
 
 
 def read_camera_info(path: Path) -> CameraInfo:
-    """Read a calibration file.
+    """Read a calibration file, also one of Kalibr or OpenCV.
 
     Raises:
         ValueError: it cannot be read, is not such a file, or has an unknown distortion model; one line that
             names the file.
     """
     # The YAML reader takes 30 ms to import, and every program with settings imports this module.
-    from vision.plain_yaml import load_plain_yaml
+    from vision.calibration.foreign_files import load_calibration
 
     try:
-        content = load_plain_yaml(path.read_bytes().decode("utf-8"))
-        if not isinstance(content, dict):
-            raise ValueError("expected a table with image_width, image_height, camera_matrix…")
+        content = load_calibration(path.read_bytes().decode("utf-8"))
         model = _lens(content)
         name = str(content.get("camera_name") or "")
         known = None if name in ("", *_DEFAULT_NAMES) else name
@@ -148,7 +151,8 @@ def read_camera_info(path: Path) -> CameraInfo:
     except OSError as error:
         raise ValueError(f"cannot read the calibration file {path}: {error.strerror}") from None
     except ValueError as error:  # UnicodeDecodeError and PlainYamlError are too
-        raise ValueError(f"the calibration file {path} cannot be used: {error}") from None
+        problem = f"the calibration file {path} cannot be used: {error}"
+        raise ValueError(explained(path, problem)) from None
 
 
 def _lens_lines(model: CameraModel, prefix: str = "") -> list[str]:
@@ -166,12 +170,15 @@ def _lens(content: dict[Any, Any], prefix: str = "") -> CameraModel:
     matrix = _numbers(content, f"{prefix}camera_matrix", 9)
     if matrix[1] != 0.0 or matrix[3] != 0.0 or matrix[6:] != (0.0, 0.0, 1.0):
         raise ValueError(f"{prefix}camera_matrix must be [fx, 0, cx, 0, fy, cy, 0, 0, 1], got {list(matrix)}")
+    model, coefficients = distortion_name(
+        _value(content, f"{prefix}distortion_model"), _numbers(content, f"{prefix}distortion_coefficients")
+    )
     return CameraModel(
         _size(content, f"{prefix}image_width"),
         _size(content, f"{prefix}image_height"),
         *(matrix[0], matrix[4], matrix[2], matrix[5]),
-        _numbers(content, f"{prefix}distortion_coefficients"),
-        _value(content, f"{prefix}distortion_model"),
+        coefficients,
+        model,
     )
 
 

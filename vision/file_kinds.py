@@ -1,0 +1,151 @@
+"""What kind of file was given by mistake, by its first bytes: one sentence with what to do about it.
+
+Each reader puts it in place of its own error, which would say only what its parser met first.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from pathlib import Path
+
+_HEAD_BYTES = 65_536
+_MAGIC: tuple[tuple[bytes, int, str], ...] = (
+    (b"\xff\xd8\xff", 0, "is a JPEG image"),
+    (b"\x89PNG\r\n\x1a\n", 0, "is a PNG image"),
+    (b"GIF8", 0, "is a GIF image"),
+    (b"II*\0", 0, "is a TIFF image"),
+    (b"MM\0*", 0, "is a TIFF image"),
+    (b"WEBP", 8, "is a WebP image"),
+    (b"AVI ", 8, "is a video (AVI)"),
+    (b"ftyp", 4, "is a video (MP4)"),
+    (b"\x1aE\xdf\xa3", 0, "is a video (Matroska, WebM)"),
+    (b"\x89MCAP0\r\n", 0, "is a recording (MCAP): `companion log show` shows it"),
+    (b"ULog\x01\x12\x35", 0, "is a log of PX4 (ULog): `companion log ulog` adds it to a recording"),
+    (b"\xa3\x95\x80", 0, "is a log of ArduPilot (dataflash): read it with a ground station"),
+    (b"#ROSBAG", 0, "is a bag of ROS 1: convert it with `mcap convert`"),
+    (b"SQLite format 3\0", 0, "is a SQLite database, such as a bag of ROS 2: convert it to MCAP"),
+    (b"\x89HDF\r\n\x1a\n", 0, "is an HDF5 file, such as Keras writes: export the model to ONNX"),
+    (b"TFL3", 4, "is a TensorFlow Lite model: export the model to ONNX"),
+    (b"\x93NUMPY", 0, "is an array of NumPy"),
+    (b"\x7fELF", 0, "is a program"),
+    (b"%PDF-", 0, "is a PDF document"),
+    (b"\x1f\x8b", 0, "is a gzip archive: unpack it and give the file that is in it"),
+    (b"BZh", 0, "is a bzip2 archive: unpack it and give the file that is in it"),
+    (b"\xfd7zXZ\0", 0, "is an xz archive: unpack it and give the file that is in it"),
+    (b"7z\xbc\xaf\x27\x1c", 0, "is a 7z archive: unpack it and give the file that is in it"),
+    (b"Rar!\x1a\x07", 0, "is a RAR archive: unpack it and give the file that is in it"),
+    (b"ustar", 257, "is a tar archive: unpack it and give the file that is in it"),
+    (b"\xff\xfe", 0, "is UTF-16 text: save it as UTF-8"),
+    (b"\xfe\xff", 0, "is UTF-16 text: save it as UTF-8"),
+)
+_TEXTS: tuple[tuple[re.Pattern[bytes], str], ...] = tuple(
+    (re.compile(pattern), sentence)
+    for pattern, sentence in (
+        (
+            rb"version https://git-lfs\.github\.com/spec/",
+            "is a pointer of Git LFS, not the file itself: run `git lfs pull` in its repository",
+        ),
+        (
+            rb"(?i:<!doctype html|<html)",
+            "is an HTML page, as a server sends for a login or an error: download the file itself",
+        ),
+        (
+            rb'\{(?s:.*)"fileType"\s*:\s*"Plan"',
+            "is a plan of QGroundControl: upload it there and fly it in the autopilot's mission mode; a "
+            "mission here is TOML",
+        ),
+        (
+            rb"QGC WPL \d",
+            "is a list of waypoints: upload it with a ground station and fly it in the autopilot's mission "
+            "mode; a mission here is TOML",
+        ),
+        (
+            rb"# (?:Onboard parameters|Vehicle-Id|MAV ID)",
+            "is a parameter file of a ground station: load it there",
+        ),
+        (rb"(?s:<\?xml.{0,500}?)?<(?:[\w.]+:)?kml\b", "is a KML file of places"),
+        (rb"(?s:<\?xml.{0,500}?)?<gpx\b", "is a GPX file of a GPS receiver"),
+        (
+            rb"(?s:<\?xml.{0,500}?)?<annotation\b",
+            "is an annotation in Pascal VOC's format (XML): convert the data set to YOLO's or COCO's format",
+        ),
+        (rb"-----BEGIN ", "is a certificate or key (PEM)"),
+    )
+)
+
+
+def wrong_file(path: Path, *fitting: str) -> str | None:
+    """What a file is, if it is of a kind that is recognised, after its name: `given.pt: is an HTML page …`.
+
+    Args:
+        fitting: beginnings of the sentences about what the caller can read, such as "is a JPEG".
+
+    Returns:
+        None for a kind that is not recognised or is fitting, and for a file that cannot be read.
+    """
+    try:
+        if not path.is_file():
+            return None
+        with path.open("rb") as file:
+            sentence = kind_of_bytes(file.read(_HEAD_BYTES))
+        if sentence is None and zipfile.is_zipfile(path):
+            sentence = _zip_kind(path)
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return None
+    return None if sentence is None or sentence.startswith(fitting or ("\0",)) else f"{path}: {sentence}"
+
+
+def explained(path: Path, problem: str, *fitting: str) -> str:
+    """The line for an error of a reader: what the file is if that is recognised, else its own problem.
+
+    Args:
+        problem: the whole line, with the path. fitting: as of `wrong_file`.
+    """
+    return wrong_file(path, *fitting) or problem
+
+
+def kind_of_bytes(head: bytes) -> str | None:
+    """The sentence about a file that begins with these bytes, without its name; None: not recognised."""
+    if not head:
+        return "is empty: copy or download it again"
+    for magic, offset, sentence in _MAGIC:
+        if head[offset : offset + len(magic)] == magic:
+            return sentence
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return next((sentence for pattern, sentence in _TEXTS if pattern.match(text)), None)
+
+
+def kind_of_text(text: str) -> str | None:
+    """The same of a text that was read already."""
+    return kind_of_bytes(text[:_HEAD_BYTES].encode())
+
+
+def has_no_index(path: Path) -> bool:
+    """Whether an MP4 file lacks its index (`moov`, ISO 14496-12), which is written when a recording ends."""
+    with path.open("rb") as file:
+        if kind_of_bytes(file.read(16)) != "is a video (MP4)":
+            return False
+        at, size = 0, path.stat().st_size
+        while at + 8 <= size:
+            file.seek(at)
+            header = file.read(16)
+            length, kind = int.from_bytes(header[:4], "big"), header[4:8]
+            if kind == b"moov":
+                return False
+            if length == 1:
+                length = int.from_bytes(header[8:16], "big")
+            if length < 8:  # 0: to the end of the file
+                return True
+            at += length
+    return True
+
+
+def _zip_kind(path: Path) -> str | None:
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    if any(name.endswith(("data.pkl", "constants.pkl")) for name in names):
+        return "is a checkpoint of torch"
+    if all(name.endswith(".npy") for name in names):
+        return "is an archive of NumPy arrays"
+    return "is a zip archive: unpack it and give the file that is in it"
