@@ -299,7 +299,7 @@ def score_lines(result: FineTuning) -> list[str]:
 def _check_output(output: Path, states: Sequence[Path], start: Path | None, *, resume: bool) -> None:
     """Raise before the training if its files would replace the model to start from, or others."""
     pair = pair_paths(output.with_suffix(WEIGHTS_SUFFIX))
-    if start is not None and start.resolve() in [path.resolve() for path in pair]:
+    if start is not None and os.path.realpath(start) in map(os.path.realpath, pair):
         raise ValueError(f"{start} is the model to start from and the output; give another --output")
     if resume:
         return

@@ -20,6 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from vision.file_kinds import explained
+
 ROUNDS = 5
 _WARM_UP = 8
 _IMAGES = 8
@@ -216,8 +218,11 @@ def read_result(path: Path) -> dict[str, Any]:
     """An earlier result, as `--json` printed it. Raises `BenchError`."""
     try:
         result = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise BenchError(f"{path}: is no result of `companion bench detector --json` ({error})") from error
+    except OSError as error:
+        raise BenchError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        problem = f"{path}: is no result of `companion bench detector --json` ({error})"
+        raise BenchError(explained(path, problem)) from error
     rows = result.get("rows") if isinstance(result, dict) else None
     if not isinstance(rows, list) or not all(isinstance(row, dict) and "p50_ms" in row for row in rows):
         raise BenchError(f"{path}: is no result of `companion bench detector --json`: it has no rows")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from companion.guidance.policy_network import Network, NetworkError, read_network
+from vision.file_kinds import explained
 
 _Format = Literal["mavlink-companion.policy.v1"]
 FORMAT: _Format = "mavlink-companion.policy.v1"
@@ -133,7 +134,7 @@ def load_policy(path: Path) -> LoadedPolicy:
     try:
         network = read_network(content)
     except NetworkError as error:
-        raise PolicyError(f"{path}: no usable ONNX file: {error}") from error
+        raise PolicyError(explained(path, f"{path}: no usable ONNX file: {error}")) from error
     text = network.metadata.get(KEY)
     if text is None:
         raise PolicyError(

@@ -14,6 +14,7 @@ from companion.key_files import KeyFileError, check_private
 from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 from vision.extras import install_command
+from vision.file_kinds import kind_of_bytes
 
 if TYPE_CHECKING:
     import httpx
@@ -79,11 +80,16 @@ def read_api_key(path: Path) -> str:
     """Read `language.key_file`, a text that only its owner can read. Raises LanguageError."""
     try:
         check_private(path, path.stat())
-        return path.read_text(encoding="utf-8").strip()
+        content = path.read_bytes()
+        if (kind := kind_of_bytes(content)) is not None:
+            raise LanguageError(f"language.key_file {path}: {kind}")
+        return content.decode("utf-8").strip()
     except KeyFileError as error:
         raise LanguageError(f"language.key_file {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise LanguageError(f"language.key_file {path}: cannot be read: {error}") from None
+    except OSError as error:
+        raise LanguageError(f"language.key_file {path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise LanguageError(f"language.key_file {path}: expected a line of text") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,6 +22,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from companion.recording import RecordingError
+from vision.file_kinds import explained
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "companion"
@@ -259,7 +260,7 @@ class RecordingReader:
         if not begin:
             raise RecordingError(f"{path}: the file is empty")
         if begin != MAGIC:
-            raise RecordingError(f"{path}: not an MCAP file")
+            raise RecordingError(explained(path, f"{path}: not an MCAP file"))
 
     def messages(self, *topics: str) -> Iterator[Recorded]:
         """Return the messages of these topics; none: of all."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from companion.toml_text import parse_toml
+from vision.file_kinds import explained
 from vision.marker_boards import MAP, Board, ned_from_marker
 from vision.markers import square
 from vision.rotation import matrix_from_euler
@@ -138,9 +139,10 @@ def _read(path: str | Path, kind: type[_Kind]) -> _Kind:
     except OSError as error:
         raise BoardError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise BoardError(f"{path}: not UTF-8 text, which TOML must be (byte {error.start})") from error
+        problem = f"{path}: not UTF-8 text, which TOML must be (byte {error.start})"
+        raise BoardError(explained(Path(path), problem)) from error
     except tomllib.TOMLDecodeError as error:
-        raise BoardError(f"{path}: not TOML: {error}") from error
+        raise BoardError(explained(Path(path), f"{path}: not TOML: {error}")) from error
     try:
         return kind.model_validate(content)
     except ValidationError as error:

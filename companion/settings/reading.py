@@ -32,6 +32,7 @@ from companion.settings.fields import (
 from companion.settings.section import Section
 from companion.settings.settings import Settings
 from companion.toml_text import parse_toml
+from vision.file_kinds import explained
 
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
 
@@ -288,10 +289,12 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise ConfigurationError(f"{path}, line {line}: not UTF-8 text, which TOML must be") from error
+        problem = f"{path}, line {line}: not UTF-8 text, which TOML must be"
+        raise ConfigurationError(explained(path, problem)) from error
     except tomllib.TOMLDecodeError as error:
         reason, _, position = str(error).rpartition(" (at ")
-        raise ConfigurationError(f"{path}, {position.removesuffix(')')}: {reason}") from error
+        problem = f"{path}, {position.removesuffix(')')}: {reason}"
+        raise ConfigurationError(explained(path, problem)) from error
 
 
 def _nearest(word: str, known: Iterable[str]) -> str:

@@ -17,6 +17,7 @@ from pathlib import Path
 from companion.key_files import KeyFileError, check_private
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
+from vision.file_kinds import kind_of_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -66,6 +67,8 @@ def read_key(path: str | Path) -> bytes:
             f"signing key {path}: expected {KEY_LENGTH} bytes or a passphrase, got more than "
             f"{MAX_KEY_FILE_BYTES} bytes"
         )
+    if content and (kind := kind_of_bytes(content)) is not None:
+        raise SigningKeyError(f"signing key {path}: {kind}")
     try:
         passphrase = content.decode("utf-8").strip()
     except UnicodeDecodeError:

@@ -244,7 +244,7 @@ FILES: dict[str, Callable[[Path], Path]] = {
     "… with `nms=True` (TorchScript)": torchscript_with_nms,
     "TorchScript named `.pt`": lambda folder: written("net.pt", torchscript())(folder),
     "TensorRT plan of others": written("net.engine", bytes(64)),
-    "`.tflite` and others": written("net.tflite", b"\x1c\x00\x00\x00TFL3"),
+    "`.tflite`": written("net.tflite", b"\x1c\x00\x00\x00TFL3"),
 }
 
 

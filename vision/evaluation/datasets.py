@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.file_kinds import explained
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
@@ -181,7 +182,7 @@ def read_coco(path: Path, images: Path | None = None) -> Dataset:
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, RecursionError) as error:
-        raise DatasetError(f"{path}: is not JSON ({error})") from None
+        raise DatasetError(explained(path, f"{path}: is not JSON ({error})")) from None
     if not isinstance(content, dict):
         raise DatasetError(f"{path}: expected an object with images, annotations and categories")
     names, ids = _categories(_entries(content, "categories", path), path)
@@ -217,7 +218,7 @@ def read_coco(path: Path, images: Path | None = None) -> Dataset:
 def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
     value = content.get(key)
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise DatasetError(f"{path}: `{key}` must be a list of objects")
+        raise DatasetError(explained(path, f"{path}: `{key}` must be a list of objects"))
     return value
 
 
@@ -326,9 +327,9 @@ def _read_table(path: Path) -> dict[Any, Any]:
     try:
         table = load_plain_yaml(path.read_text(encoding="utf-8"))
     except (PlainYamlError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: {error}") from None
-    if not isinstance(table, dict):
-        raise DatasetError(f"{path}: expected a table with `names` and `val`")
+        raise DatasetError(explained(path, f"{path}: {error}")) from None
+    if not isinstance(table, dict) or not table.keys() & {"names", "nc", "path", *_SPLITS}:
+        raise DatasetError(explained(path, f"{path}: expected a table with `names` and `val`"))
     return table
 
 

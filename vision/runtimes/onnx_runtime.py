@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,11 @@ def _ports(nodes: Any) -> list[Port]:
     ]
 
 
+# Of its errors: `[ONNXRuntimeError] : 7 : INVALID_PROTOBUF : Load model from FILE failed:`.
+_PREFIX = re.compile(r"^\[ONNXRuntimeError\] : \d+ : \w+ : (?:Load model from .*? failed:)?")
+_NO_MODEL = ("Protobuf parsing failed.", "No graph was found in the protobuf.")
+
+
 def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -> Any:
     if not path.is_file():
         raise RuntimeUnusableError(f"{path}: no such file")
@@ -121,6 +127,8 @@ def _session(onnxruntime: Any, path: Path, options: Any, providers: list[str]) -
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     # Its errors have no common base class but Exception.
     except Exception as error:
-        raise RuntimeUnusableError(
-            f"{path}: onnxruntime cannot load it: {' '.join(str(error).split())}"
-        ) from error
+        reason = _PREFIX.sub("", " ".join(str(error).split()))
+        if reason in _NO_MODEL:
+            reason = "is not an ONNX model, or damaged; export or copy it again"
+            raise RuntimeUnusableError(f"{path}: {reason}") from error
+        raise RuntimeUnusableError(f"{path}: onnxruntime cannot load it: {reason}") from error

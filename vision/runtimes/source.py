@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from vision.extras import install_command
+from vision.file_kinds import explained, wrong_file
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.model_files import missing_model_advice
 from vision.runtimes.base import (
@@ -35,6 +36,9 @@ _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
     "tensorrt": ("tensorrt",),
     "torchscript": ("torch",),
 }
+
+# A TorchScript file is an archive of torch too.
+_FITTING = ("is a checkpoint of torch",)
 
 
 @dataclass(slots=True)
@@ -131,6 +135,8 @@ def read_source(path: Path) -> ModelSource:
         )
     if not path.is_file():
         raise RuntimeUnusableError(f"{path}: no such file; {missing_model_advice(path)}")
+    if (what := wrong_file(path, *_FITTING)) is not None:
+        raise RuntimeUnusableError(what)
     found = _facts(path, kind)
     if isinstance(found, ForeignFacts):
         strides = (found.stride,)
@@ -160,10 +166,13 @@ def check_model_file(path: Path, runtime: RuntimeName | Literal["auto"] | None) 
             raise CheckpointError(f"{file}: no such file; {missing_model_advice(file)}")
         if not os.access(file, os.R_OK):
             raise CheckpointError(f"{file}: no permission to read it")
+    if kind is not None and (what := wrong_file(path, *_FITTING)) is not None:
+        raise RuntimeUnusableError(what)
     if kind is None and len(files) == 1:
         with path.open("rb") as opened:
             if opened.read(2) != b"PK":  # the zip archive of torch.save
-                raise CheckpointError(f"{path}: neither a checkpoint nor an exported model")
+                problem = f"{path}: neither a checkpoint nor an exported model"
+                raise CheckpointError(explained(path, problem))
     if kind is None and not installed("torch"):
         raise _needs_torch(path)
     source = ModelSource(path, kind, (), {}, (), None, None)

@@ -43,6 +43,8 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
             image = np.load(io.BytesIO(data), allow_pickle=False)
         except (ValueError, EOFError, OSError):
             return None
+        if not isinstance(image, np.ndarray):  # an archive of several
+            return None
     elif data:
         try:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)

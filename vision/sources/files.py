@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.file_kinds import explained, has_no_index
 from vision.sources.capture import Capture, RawFrame
 from vision.sources.opencv import open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
@@ -130,6 +131,8 @@ class ImagesCapture(Capture):
                 media_s = index * self.interval_s
                 return RawFrame(image, media_s=media_s, decode_ms=decode_ms, file_name=path.name)
             self.unreadable += 1
+            if self.total_frames == 1:
+                raise SourceError(explained(path, f"{path}: {reason}"))
             logger.warning("%s: skipped: %s", path, reason)
         if self.unreadable == len(self._paths):
             raise SourceError(f"{self._paths[0][1]}: none of the {len(self._paths)} images could be read")
@@ -156,10 +159,16 @@ class VideoFileCapture(Capture):
         self._path = path
         self._capture = open_ffmpeg(str(path))
         if not self._capture.isOpened():
-            raise SourceError(
+            if has_no_index(path):
+                raise SourceError(
+                    f"{path}: is an MP4 video without its index (moov): its recording or copy was not ended; "
+                    f"copy it again, or repair it with untrunc"
+                )
+            problem = (
                 f"{path}: no video that FFmpeg can read ({path.stat().st_size} bytes); it may be damaged or "
                 f"another kind of file"
             )
+            raise SourceError(explained(path, problem, "is a video"))
         claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.total_frames = int(claimed) if 0 < claimed < 1e9 else None
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)

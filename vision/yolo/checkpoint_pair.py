@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from safetensors import SafetensorError, safe_open
 
+from vision.file_kinds import explained
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
 from vision.yolo.safe_pickle import CheckpointError, one_line
 
@@ -135,9 +136,9 @@ def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
     except UnicodeDecodeError:
-        raise CheckpointError(f"{path}: is not UTF-8 text") from None
+        raise CheckpointError(explained(path, f"{path}: is not UTF-8 text")) from None
     except PlainYamlError as error:
-        raise CheckpointError(one_line(f"{path}: {error}")) from None
+        raise CheckpointError(one_line(explained(path, f"{path}: {error}"))) from None
     if not isinstance(table, dict):
         raise CheckpointError(f"{path}: expected a table with `format` and `architecture`")
     found = table.pop("format", None)

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
+from vision.file_kinds import explained
 from vision.model_files import missing_model_advice
 from vision.yolo.safe_pickle import (
     AllowedGlobal,
@@ -140,7 +141,7 @@ def read_archive(path: str | Path) -> Any:
     try:
         return _read(path)
     except CheckpointError as error:
-        raise type(error)(one_line(f"{path}: {error}")) from None
+        raise type(error)(one_line(explained(path, f"{path}: {error}", "is a checkpoint of torch"))) from None
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}") from None
     except IsADirectoryError:

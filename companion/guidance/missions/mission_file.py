@@ -48,6 +48,7 @@ from companion.guidance.missions.sequence import (
 )
 from companion.guidance.search_pattern import Footprint
 from companion.toml_text import parse_toml
+from vision.file_kinds import explained, kind_of_text
 
 MISSIONS_FOLDER = Path(__file__).parent
 LARGEST_BYTES = 100_000
@@ -149,8 +150,10 @@ def read_mission(path: Path) -> str:
         if size > LARGEST_BYTES:
             raise MissionError(f"{path}: a mission has at most {LARGEST_BYTES} bytes, this file has {size}")
         return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise MissionError(f"{path}: cannot be read: {error}") from error
+    except OSError as error:
+        raise MissionError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise MissionError(explained(path, f"{path}: cannot be read: {error}")) from error
 
 
 def plan_from(
@@ -174,7 +177,8 @@ def plan_from(
     try:
         written = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
-        raise MissionError(f"{source}: invalid TOML: {error}") from error
+        problem = kind_of_text(text) or f"invalid TOML: {error}"
+        raise MissionError(f"{source}: {problem}") from error
     problems: list[str] = []
     table = None
     try:

@@ -1,0 +1,243 @@
+"""Every reader of a file on the command line, given every wrong file: one line that names it, exit code 2."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import typer.main
+
+from companion.cli import app
+from companion.recording.files import write_messages
+from companion.settings.reading import flags
+from tests.companion.command_line import companion_here
+from vision.calibration.camera_info import write_camera_info
+from vision.camera_model import CameraModel
+from vision.weights import DEFAULT_EXPORT
+
+# Parameter → its readers: the arguments, with {} for the file, and the suffix that selects the reader.
+_DETECT = "detect {} --limit 1"
+_LENS = "calibrate lens {} --board chessboard 7x5 --square 0.03"
+_EXTRINSICS = (
+    "calibrate extrinsics {colour} {infrared} --board chessboard 7x5 --square 0.03 --colour-calibration "
+    "{colour_calibration} --infrared-calibration {infrared_calibration}"
+)
+_MODELS = (".pt", ".pth", ".safetensors", ".onnx", ".xml", ".engine", ".torchscript", ".tflite")
+_SOURCES = (".mp4", ".jpg", ".npy")
+
+
+def _extrinsics(name: str) -> str:
+    others = {"colour": "frame.png", "infrared": "frame.png"}
+    others |= {"colour_calibration": "camera.yaml", "infrared_calibration": "camera.yaml"}
+    return _EXTRINSICS.format(**{**others, name: "{}"})
+
+
+READERS: dict[str, tuple[tuple[str, str], ...]] = {
+    "detect source": tuple((_DETECT, suffix) for suffix in _SOURCES),
+    "detect model": (("detect frame.png --model {}", ".onnx"), ("detect frame.png --model {}", ".pt")),
+    "mcp token_file": (("mcp --listen 127.0.0.1:0 --token-file {}", ".txt"),),
+    "preview source": (("preview {} --limit 1", ".mp4"),),
+    "depth source": (("depth {} --limit 1", ".mp4"),),
+    "mission file": (("mission {} --check", ".toml"),),
+    "cloud source": (("cloud {} out.ply", ".mp4"),),
+    "replay files": (("replay {}", ".mcap"),),
+    "sightings files": (("sightings --kml {}", ".mcap"),),
+    "collect files": (("collect folder {}", ".mcap"),),
+    "evaluate dataset": (("evaluate {}", ".yaml"), ("evaluate {}", ".json")),
+    "evaluate model": (("evaluate labelled --model {}", ".pt"),),
+    "evaluate images": (("evaluate annotations.json --images {}", ".zip"),),
+    "train start": (("train --data labelled --steps 1 --from {}", ".pt"),),
+    "train data": (("train --data {} --steps 1", ".yaml"),),
+    "train validation": (("train --data labelled --steps 1 --validation {}", ".yaml"),),
+    "models info file": tuple(("models info {}", suffix) for suffix in _MODELS),
+    "models export file": (("models export {} --to onnx", ".pt"),),
+    "models export calibrate": (
+        ("models export default --to onnx --output out.onnx --precision int8 --calibrate {}", ".zip"),
+    ),
+    "models verify source": (("models verify {} frame.png", ".pt"),),
+    "models verify exported": (("models verify default {}", ".onnx"),),
+    "models verify images": (("models verify default bundled.onnx --images {}", ".zip"),),
+    "calibrate lens source": ((_LENS, ".mp4"),),
+    "calibrate extrinsics colour": ((_extrinsics("colour"), ".mp4"),),
+    "calibrate extrinsics infrared": ((_extrinsics("infrared"), ".mp4"),),
+    "calibrate extrinsics colour_calibration": ((_extrinsics("colour_calibration"), ".yaml"),),
+    "calibrate extrinsics infrared_calibration": ((_extrinsics("infrared_calibration"), ".yaml"),),
+    "calibrate mount source": (("calibrate mount {} --marker 0 --size 0.1", ".mp4"),),
+    "calibrate mount calibration": (
+        ("calibrate mount frame.png --marker 0 --size 0.1 --calibration {}", ".yaml"),
+    ),
+    "markers detect source": (("markers detect {} --dictionary 4X4_50 --size 0.1", ".mp4"),),
+    "bench detector model": (("bench detector --model {} --frames 5", ".onnx"),),
+    "bench detector against": (("bench detector --against {}", ".json"),),
+    "log list directory": (("log list {}", ".mcap"),),
+    "log show file": (("log show {}", ".mcap"),),
+    "log recover file": (("log recover {} out.mcap", ".mcap"),),
+    "log tlog file": (("log tlog {} out.tlog", ".mcap"),),
+    "log ulog file": (("log ulog {} flight.ulg -o out.mcap", ".mcap"),),
+    "log ulog ulog": (("log ulog flight.mcap {} -o out.mcap", ".ulg"),),
+    "config": (("config --config {}", ".toml"),),
+    "vehicle.signing_key_file": (("config --check --vehicle-signing-key-file {}", ".key"),),
+    "source.depth": (("depth frame.png --source-depth {} --limit 1", ".npy"),),
+    "source.depth_calibration_file": (
+        ("config --source-depth frame.png --source-depth-calibration-file {}", ".yaml"),
+    ),
+    "camera.calibration_file": (("config --camera-calibration-file {}", ".yaml"),),
+    "markers.boards_file": (("config --markers-boards-file {}", ".toml"),),
+    "markers.map_file": (("config --markers-map-file {}", ".toml"),),
+    "zenoh.config_file": (("config --check --zenoh-config-file {}", ".json5"),),
+    "zenoh.child_config_file": (("config --check --zenoh-child-config-file {}", ".json5"),),
+    "dashboard.token_file": (("config --check --dashboard-token-file {}", ".txt"),),
+    "language.key_file": (("config --check --language-key-file {}", ".txt"),),
+}
+_PLAN = {"fileType": "Plan", "groundStation": "QGroundControl", "mission": {"items": []}, "version": 1}
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+    path.chmod(0o600)
+
+
+def make_wrong(folder: Path, kind: str, suffix: str) -> Path:
+    path = folder / f"given{suffix}"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "unreadable":
+        path.symlink_to(path.name)  # a loop: unreadable for root too
+    elif kind == "device":
+        path.symlink_to("/dev/null")
+    elif kind == "zip":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("readme.txt", "hello")
+        path.chmod(0o600)
+    elif kind != "missing":
+        _write(path, CONTENTS[kind])
+    return path
+
+
+CONTENTS = {
+    "empty": b"",
+    "random": np.random.default_rng(1).integers(0, 256, 5000, np.uint8).tobytes(),
+    "html": b"<!DOCTYPE html>\n<html><head><title>Sign in</title></head><body></body></html>\n",
+    "lfs": b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"4d" * 32 + b"\nsize 12345\n",
+    "utf16": 'name = "caf\u00e9"\n'.encode("utf-16"),
+    "jpeg": cv2.imencode(".jpg", np.zeros((64, 64, 3), np.uint8))[1].tobytes(),
+    "mp4_header": b"\0\0\0\x20ftypisom" + bytes(20) + b"\0\0\x10\0mdat" + bytes(4000),
+    "toml": b'title = "x"\n[owner]\nname = "y"\n',
+    "json": b'{"a": [1, 2, 3]}\n',
+    "xml": b'<?xml version="1.0"?>\n<annotation><object/></annotation>\n',
+    "plan": json.dumps(_PLAN).encode(),
+    "waypoints": b"QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t47.4\t8.5\t488\t1\n",
+    "line": b"a" * 3_000_000,
+}
+KINDS = (*CONTENTS, "zip", "folder", "missing", "unreadable", "device")
+
+# Other parameters that are text or paths: written, not read; or no files.
+WRITTEN = {
+    "demo output", "detect save", "preview save", "depth save", "topics schema", "cloud output", "cloud view",
+    "record directory", "collect folder", "evaluate misses", "train output", "train-policy output",
+    "models list folder", "models pull folder", "models export output", "calibrate lens output",
+    "calibrate lens report", "calibrate extrinsics output", "markers detect save", "markers print output",
+    "log recover output", "log tlog output", "log ulog output", "recording.video", "recording.directory",
+}  # fmt: skip
+# Read by what other rows run: the service opens them as `detect` does.
+ELSEWHERE = {"view source", "play scene", "replay model", "source.uri", "detector.model"}
+NO_FILES = {
+    "connect", "seeds", "ray", "vehicle_url", "detector_kind", "classes", "runtime", "precision", "device",
+    "pixel_format", "plugins_modules", "command", "key", "sentence", "allow", "listen", "changes", "camera",
+    "split", "environment", "algorithm", "name", "url", "to", "board", "dictionary", "printed",
+    "identifiers", "paper", "frame",
+}  # fmt: skip
+# What these readers take: an image by its content; any text as a passphrase or key; an empty settings file.
+_IMAGES = {
+    name: {"jpeg"}
+    for name, rows in READERS.items()
+    if name.endswith((" source", " colour", " infrared")) and not name.startswith("models")
+}
+ACCEPTED: dict[str, set[str]] = _IMAGES | {
+    "config": {"empty", "device"},
+    "vehicle.signing_key_file": {"toml", "json"},
+    "language.key_file": {"toml", "json", "line"},
+    "log list directory": {"folder"},
+}
+_FOREIGN = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|Traceback|[Pp]rotobuf|\.cpp|site-packages|Errno")
+
+
+def _parameters(command: Any, name: str = "") -> set[str]:
+    if hasattr(command, "commands"):
+        below = command.commands.items()
+        return set().union(*(_parameters(each, f"{name} {word}".strip()) for word, each in below))
+    given = (each for each in command.params if each.type.name in ("path", "text", "str"))
+    return {f"{name} {each.name}" for each in given if each.name not in ("config_file", *NO_FILES)}
+
+
+def test_every_file_of_the_command_line_is_tried() -> None:
+    found = _parameters(typer.main.get_command(app))
+    named = re.compile(r"_file$|^source\.(uri|depth)$|^detector\.model$|^recording\.(video|directory)$")
+    found |= {flag.key for flag in flags() if named.search(flag.key)}
+    assert found == (READERS.keys() | WRITTEN | ELSEWHERE) - {"config"}
+
+
+@pytest.fixture
+def right(tmp_path: Path) -> Path:
+    """A folder with the files that the other arguments name."""
+    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((480, 640, 3), np.uint8))
+    write_camera_info(tmp_path / "camera.yaml", CameraModel(640, 480, 600.0, 600.0, 320.0, 240.0), "camera")
+    labelled = tmp_path / "labelled"
+    (labelled / "images").mkdir(parents=True)
+    (labelled / "labels").mkdir()
+    shutil.copy(tmp_path / "frame.png", labelled / "images" / "a.png")
+    (labelled / "labels" / "a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    coco = {
+        "images": [{"id": 1, "file_name": "a.png"}],
+        "annotations": [],
+        "categories": [{"id": 1, "name": "x"}],
+    }
+    (tmp_path / "annotations.json").write_text(json.dumps(coco))
+    shutil.copy(DEFAULT_EXPORT, tmp_path / "bundled.onnx")
+    write_messages(tmp_path / "flight.mcap", (), {})
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "suffix"),
+    [
+        pytest.param(name, arguments, suffix, id=f"{name}{suffix}")
+        for name, rows in READERS.items()
+        for arguments, suffix in rows
+    ],
+)
+def test_a_wrong_file_is_one_line(
+    name: str,
+    arguments: str,
+    suffix: str,
+    right: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(right / "cache"))
+    faults = []
+    for kind in KINDS:
+        if kind in ACCEPTED.get(name, ()):
+            continue
+        path = make_wrong(right, kind, suffix)
+        words = [word.replace("{}", path.name) for word in arguments.split()]
+        try:
+            done = companion_here(*words, cwd=right)
+        except Exception as error:  # a traceback for a person
+            faults.append((kind, repr(error)))
+        else:
+            lines = done.stderr.splitlines()
+            # TOML is read, and every problem of its keys is a line.
+            whole = all("given" in line for line in lines) and (len(lines) == 1 or kind == "toml")
+            if done.returncode != 2 or not whole or _FOREIGN.search(done.stderr):
+                faults.append((kind, f"{done.returncode}: {done.stderr}"))
+        path.rmdir() if kind == "folder" else path.unlink(missing_ok=True)
+    assert not faults
+    assert capfd.readouterr().err == ""  # of libraries that write to standard error themselves
