@@ -21,7 +21,7 @@ class Frame:
             depth.
         ready_ns: CLOCK_MONOTONIC nanoseconds when the image was decoded; 0 if unknown.
         decode_ms: decoding time, milliseconds.
-        media_s: position in the recording, seconds; None for a live source.
+        media_s: time in the recording or stream, seconds since its start, which increases; None without one.
         file_name: of the image or video, without folder; empty if the frame is not from a file.
         image_since_ns: capture of the first of the identical colour images that end with this one; None: not
             compared (`FrameChanges`). depth_since_ns: the same of the depth images.

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
-from vision.sources.capture import LoopingCapture
-from vision.sources.files import ImagesCapture, natural_key
+from vision.sources.files import natural_key
 from vision.sources.source import SourceStatistics
 
 pytestmark = pytest.mark.realtime
@@ -70,9 +69,9 @@ def test_looped_single_image_keeps_the_interval(count: int, tmp_path: Path) -> N
     paths = [tmp_path / f"{number}.png" for number in range(count)]
     for path in paths:
         cv2.imwrite(str(path), np.zeros((8, 8, 3), np.uint8))
-    capture = LoopingCapture(lambda: ImagesCapture(paths, rate_hz=10.0))
-    frames_at = [capture.read(1.0) for _ in range(5)]
-    assert [raw.media_s for raw in frames_at if raw] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    with open_source(str(tmp_path), SourceSettings(loop=True, rate_hz=10.0)) as source:
+        frames = [source.read() for _ in range(5)]
+    assert [frame.media_s for frame in frames if frame] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
 
 
 def test_a_video_in_real_time_keeps_its_own_pace_and_ends(video: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -16,6 +17,10 @@ from vision.orientation import Orientation
 from vision.sources.depth_images import to_metres
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
+LONGEST_STEP_S = 5.0
+"""A larger step of a recording's or stream's stamps is a discontinuity, not a pause."""
+_LONGEST_LAG_S = 1.0  # of stamps behind the media time that may catch up with it
+
 
 class CaptureError(Exception):
     """The capture stopped or could not be opened; another attempt may succeed."""
@@ -29,7 +34,8 @@ class RawFrame:
         image: (height, width, 3) uint8, BGR.
         captured_ns: CLOCK_MONOTONIC nanoseconds; None for a file, whose frames are captured when read.
         depth_m: (height, width) float32 metres along the optical axis, or None.
-        media_s: seconds since the start of the recording, for pacing; None where there is no such time.
+        media_s: the recording's own stamp, seconds, as it is (`MediaTime` makes the media time of it); None
+            where there is no such time.
         skipped: frames that the writer overwrote since the previous one.
         decode_ms: decoding time, milliseconds, as far as the library exposes it.
         file_name: of the image or video, without folder; empty if the frame is not from a file.
@@ -66,7 +72,7 @@ class Capture(ABC):
         total_frames: number of frames, if known.
         unreadable: frames that could not be decoded so far.
         silence_is_loss: whether reopening may help when no data arrives for a while.
-        interval_s: frame interval of a recording, used where stamps do not give one.
+        interval_s: frame interval of a recording, seconds, used where stamps do not give one.
         calibration: the camera's lens and mount, if it provides them.
     """
 
@@ -97,17 +103,55 @@ OpenCapture = Callable[[], Capture]
 """Opens a capture. Raises CaptureError if another attempt may help, SourceError if not."""
 
 
+class MediaTime:
+    """The media time of a source, from the stamps of a recording or stream, which are not trusted.
+
+    It begins at the first stamp, or at 0 if that is negative or late, and increases with every frame. A stamp
+    that jumps, repeats or goes back counts as one interval; the following ones continue from there.
+    """
+
+    def __init__(self) -> None:
+        self._media_s: float | None = None
+        self._stamp_s = 0.0
+        self._offset_s = 0.0
+
+    def of(self, raw: RawFrame, interval_s: float) -> RawFrame:
+        """The frame with its media time as `media_s`."""
+        if raw.media_s is None:
+            return raw
+        return replace(raw, media_s=self.advance(raw.media_s, interval_s))
+
+    def advance(self, stamp_s: float, interval_s: float) -> float:
+        """Seconds since the start at the next frame. `interval_s`: where the stamp does not give a step."""
+        before_s, longest_s = self._media_s, max(LONGEST_STEP_S, 3 * interval_s)
+        media_s = stamp_s + self._offset_s
+        if before_s is None:
+            if not 0.0 <= media_s <= longest_s:
+                media_s = 0.0
+                self._continue_from(media_s, stamp_s)
+        elif not 0.0 < media_s - before_s <= longest_s:
+            jumped = not -_LONGEST_LAG_S <= media_s - before_s <= 0.0
+            went_back = stamp_s < self._stamp_s - 3 * interval_s
+            media_s = before_s + interval_s
+            # A repeated stamp, or two in the wrong order, is followed by right ones.
+            if jumped or went_back:
+                self._continue_from(media_s, stamp_s)
+        self._media_s, self._stamp_s = media_s, stamp_s
+        return media_s
+
+    def _continue_from(self, media_s: float, stamp_s: float) -> None:
+        if math.isfinite(stamp_s):
+            self._offset_s = media_s - stamp_s
+
+
 class LoopingCapture(Capture):
-    """A file that restarts at its end; its media time continues."""
+    """A file that restarts at its end."""
 
     def __init__(self, open_capture: OpenCapture) -> None:
         self._open_capture = open_capture
         self._capture = open_capture()
         self._unreadable_before = 0
         self._frames = 0
-        self._offset_s = 0.0
-        self._last_s = 0.0
-        self._interval_s = 0.0
 
     def read(self, timeout_s: float) -> RawFrame | None:
         try:
@@ -118,23 +162,14 @@ class LoopingCapture(Capture):
             self._restart()
             raw = self._capture.read(timeout_s)
         self.unreadable = self._unreadable_before + self._capture.unreadable
-        if raw is None:
-            return None
-        self._frames += 1
-        if raw.media_s is None:
-            return raw
-        if self._frames > 1:
-            self._interval_s = max(raw.media_s - self._last_s, 0.0)
-        self._last_s = raw.media_s
-        return replace(raw, media_s=raw.media_s + self._offset_s)
+        self.interval_s = self._capture.interval_s
+        self._frames += raw is not None
+        return raw
 
     def _restart(self) -> None:
         self._capture.close()
         self._unreadable_before += self._capture.unreadable
-        # A single image gets the default interval: otherwise it would be read in a busy loop.
-        self._offset_s += self._last_s + (self._interval_s or self._capture.interval_s)
         self._capture = self._open_capture()
-        self._last_s = self._interval_s = 0.0
         self._frames = 0
 
     def close(self) -> None:

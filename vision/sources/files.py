@@ -14,11 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.file_kinds import explained, has_no_index
-from vision.sources.capture import Capture, RawFrame
-from vision.sources.opencv import open_ffmpeg, quiet_opencv
+from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
+from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
 
 logger = logging.getLogger(__name__)
+
+_CAP_PROP_PTS = 71  # stamp in frame intervals; its name is missing before OpenCV 4.11, where it is 0
 
 IMAGE_SUFFIXES = frozenset(
     (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif")
@@ -169,30 +171,46 @@ class VideoFileCapture(Capture):
                 f"another kind of file"
             )
             raise SourceError(explained(path, problem, "is a video"))
-        claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self.total_frames = int(claimed) if 0 < claimed < 1e9 else None
-        rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
-        self.interval_s = 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / 25.0
+        self.interval_s = interval_of(self._capture)
+        self._grabbed = self._capture.grab()
+        self._claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        # Stamps count from the first frame, but the claimed number of a file may count from 0.
+        start_s = self._capture.get(_CAP_PROP_PTS) * self.interval_s
+        self._latest_s = self._start_s = max(start_s - self._stamp_s(), 0.0)
+        if 0 < self._claimed < 1e9 and self._start_s <= LONGEST_STEP_S:
+            self.total_frames = int(self._claimed)
         self._delivered = 0
-        self._last_s = -self.interval_s
 
     def read(self, timeout_s: float) -> RawFrame | None:
         started_ns = time.monotonic_ns()
-        ok, image = self._capture.read()
+        ok, image = self._capture.retrieve() if self._grabbed or self._capture.grab() else (False, None)
+        self._grabbed = False
         decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file read does not wait
         if not ok:
-            # OpenCV does not distinguish an end from damage; the frame count in the file does.
-            missing = (self.total_frames or 0) - self._delivered
-            if missing > max(2, 0.02 * (self.total_frames or 0)):
-                raise EndOfStream(f"the file should have {self.total_frames}; it is truncated or damaged")
+            missing = self._missing()
+            if missing > max(2, 0.02 * (self._delivered + missing)):
+                expected = self._delivered + missing
+                raise EndOfStream(f"the file should have {expected}; it is truncated or damaged")
             raise EndOfStream
         self._delivered += 1
-        stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-        if not stamp_s > self._last_s:  # some containers carry no stamps, or repeat them
-            stamp_s = self._last_s + self.interval_s
-        self._last_s = stamp_s
+        stamp_s = self._stamp_s()
+        self._latest_s = max(self._latest_s, self._start_s + stamp_s)
         pixels = np.ascontiguousarray(image, dtype=np.uint8)
         return RawFrame(pixels, media_s=stamp_s, decode_ms=decode_ms, file_name=self._path.name)
+
+    def _stamp_s(self) -> float:
+        return self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+
+    def _missing(self) -> int:
+        """Frames that did not come: OpenCV does not distinguish an end from damage.
+
+        Of many containers its count is duration times rate, and the duration lasts until the latest stamp,
+        which may be late or wrong: frames are missing only if time is missing too.
+        """
+        if not 0 < self._claimed < 1e9:
+            return 0
+        missing_s = self._claimed * self.interval_s - self._latest_s - self.interval_s
+        return int(min(self._claimed - self._delivered, round(missing_s / self.interval_s)))
 
     def close(self) -> None:
         self._capture.release()

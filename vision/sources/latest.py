@@ -13,7 +13,16 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from vision.frame import Frame
-from vision.sources.capture import Capture, CaptureError, OpenCapture, RawFrame, adapted, label
+from vision.sources.capture import (
+    LONGEST_STEP_S,
+    Capture,
+    CaptureError,
+    MediaTime,
+    OpenCapture,
+    RawFrame,
+    adapted,
+    label,
+)
 from vision.sources.source import (
     CameraChangedError,
     EndOfStream,
@@ -70,6 +79,7 @@ class LatestSource(Source):
         self._end: Exception | None = None
         self._last_reason = "nothing arrived"
         self._sequence = 0
+        self._media_time = MediaTime()
         self._statistics = SourceStatistics()
         self._unreadable_before = 0
         self._lost_since_s: float | None = None
@@ -234,6 +244,7 @@ class LatestSource(Source):
                 if warned_silent:
                     logger.info("%s: recovered after %.1f s", self.uri, silent_s)
                 warned_silent = False
+                raw = self._media_time.of(raw, capture.interval_s)
                 self._pace(raw)
                 self._publish(raw, capture)
                 received_s = time.monotonic()
@@ -251,7 +262,10 @@ class LatestSource(Source):
             return
         if self._pace_origin_s is None:
             self._pace_origin_s = time.monotonic() - raw.media_s
-        self._stop.wait(max(self._pace_origin_s + raw.media_s - time.monotonic(), 0.0))
+        wait_s = self._pace_origin_s + raw.media_s - time.monotonic()
+        if wait_s > LONGEST_STEP_S:
+            logger.info("%s: the next frame of the recording is due in %.0f s", self.uri, wait_s)
+        self._stop.wait(max(wait_s, 0.0))
 
     def _publish(self, raw: RawFrame, capture: Capture) -> None:
         unreadable = self._unreadable_before + capture.unreadable

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.sources.capture import Capture, CaptureError, RawFrame
-from vision.sources.opencv import open_ffmpeg, read_capture
+from vision.sources.opencv import interval_of, open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings, SourceUnavailableError
 from vision.sources.stream_formats import MjpegParser
 
@@ -34,7 +34,6 @@ _LOW_LATENCY = {"fflags": "nobuffer", "flags": "low_delay"}
 # RFC 3551 (JPEG is the static type 26), RFC 6184 (H.264), RFC 7798 (H.265).
 _RTP_FORMATS = {"rtp-h264": "H264/90000", "rtp-h265": "H265/90000", "rtp-jpeg": "JPEG/90000"}
 _JPEG_PAYLOAD, _FIRST_DYNAMIC_PAYLOAD = 26, 96
-_LONGEST_STEP_S = 1.0  # a larger step of the stream's time is a discontinuity, not a pause
 _JPEG_TYPES = ("multipart/x-mixed-replace", "image/jpeg", "image/jpg", "video/x-motion-jpeg", "video/x-jpeg")
 _HTTP_ERRORS = {
     401: "requires a user and password",
@@ -75,12 +74,11 @@ class StreamCapture(Capture):
             read_timeout_s=settings.read_timeout_s,
             options=options,
         )
-        self._media_s = 0.0
-        self._stamp_s: float | None = None
         # FFmpeg opens RTP by its description alone; without a size no data has arrived.
         if not (self._capture.isOpened() and self._capture.get(cv2.CAP_PROP_FRAME_WIDTH) > 0):
             self._capture.release()
             raise CaptureError(reason or "no video stream received")
+        self.interval_s = interval_of(self._capture)
 
     def read(self, timeout_s: float) -> RawFrame | None:
         image, captured_ns, decode_ms = read_capture(self._capture)
@@ -88,11 +86,7 @@ class StreamCapture(Capture):
             # OpenCV does not distinguish the end of a stream from a timeout of `read_timeout_s`.
             raise CaptureError("the stream stopped")
         stamp_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
-        step_s = 0.0 if self._stamp_s is None else stamp_s - self._stamp_s
-        self._stamp_s = stamp_s
-        if 0.0 <= step_s <= _LONGEST_STEP_S:
-            self._media_s += step_s
-        return RawFrame(image, captured_ns, media_s=self._media_s, decode_ms=decode_ms)
+        return RawFrame(image, captured_ns, media_s=stamp_s, decode_ms=decode_ms)
 
     def close(self) -> None:
         self._capture.release()

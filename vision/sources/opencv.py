@@ -64,6 +64,12 @@ def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, i
     return np.ascontiguousarray(image, dtype=np.uint8), arrived_ns, decode_ms
 
 
+def interval_of(capture: cv2.VideoCapture) -> float:
+    """Frame interval of an open capture, seconds; 1/25 if it states none that is plausible."""
+    rate_hz = capture.get(cv2.CAP_PROP_FPS)
+    return 1.0 / rate_hz if 0.1 < rate_hz < 1000.0 else 1.0 / 25.0
+
+
 def open_ffmpeg(
     location: str,
     *,

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 
 from vision.frame import Frame
-from vision.sources.capture import CaptureError, OpenCapture, RawFrame, adapted, label
+from vision.sources.capture import CaptureError, MediaTime, OpenCapture, RawFrame, adapted, label
 from vision.sources.source import (
     EndOfStream,
     Source,
@@ -41,6 +41,7 @@ class SequentialSource(Source):
         except CaptureError as lost:
             raise SourceUnavailableError(f"{self.uri}: {lost}") from lost
         self._sequence = 0
+        self._media_time = MediaTime()
         self._delivered = 0
         self._dropped = 0
         self._unreadable_seen = 0
@@ -88,7 +89,7 @@ class SequentialSource(Source):
         self._sequence += raw.skipped + self._capture.unreadable - self._unreadable_seen
         self._unreadable_seen = self._capture.unreadable
         self._dropped += raw.skipped
-        frame = raw.numbered(self._sequence)
+        frame = self._media_time.of(raw, self._capture.interval_s).numbered(self._sequence)
         self._sequence += 1
         self._delivered += 1
         if self._on_frame is not None:
