@@ -110,18 +110,17 @@ class PerceptionCamera:
         return f"camera frozen: the same {self._repeated} for {age_s:.1f} s"
 
     def blind(self, now_ns: int) -> str:
-        """Why results do not arrive as expected, in words; empty: they do, or none are expected."""
-        if not self.settings.detector.enabled:
-            return ""
+        """Why results do not arrive as expected, in words; empty: they do. Each is of a frame."""
+        what = "result" if self.settings.detector.enabled else "frame"
         age_s = self.age_s(now_ns)
         if age_s is None:
-            return "no result yet"
+            return f"no {what} yet"
         allowed_s = max(_SEEING_S, self.settings.guidance.perception_max_age_s)
         # Just before the next result the newest is as old as its own latency and one interval.
         usual_s = statistics.median(self._between_s) if self._between_s else 0.0
         if age_s <= allowed_s + 2 * usual_s:
             return ""
-        return self.frozen(now_ns) or f"no result for {age_s:.1f} s"
+        return self.frozen(now_ns) or f"no {what} for {age_s:.1f} s"
 
     def ranging(self, pitch_rad: float) -> RangeMeans:
         """Return the available means of range estimation; all of them before the first result.

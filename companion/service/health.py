@@ -62,7 +62,7 @@ class Health:
         )
 
     def unhealthy(self, now_ns: int) -> list[str]:
-        """Which camera delivers no results, and whether an expected autopilot is missing, with reasons."""
+        """Which camera delivers no results (or frames), and a missing autopilot, with reasons."""
         state, reasons = self._driver.state, list[str]()
         if self._has_vehicle and not state.connected(now_ns):
             silent = f"for {(now_ns - state.heartbeat_ns) / 1e9:.0f} s" if state.heartbeat_ns else "yet"

@@ -9,6 +9,7 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.guidance.interface import GuidanceInput, StreamStatus
 from companion.perception.cameras import PerceptionCamera
 from companion.service.inputs import InputAssembler
+from companion.settings import DetectorSection, Settings
 from companion.vehicle.state import LandedState, VehicleState
 from companion.vehicle.streamer import StreamState
 from vision.detections import Detections
@@ -153,3 +154,17 @@ def test_a_frozen_image_leaves_the_obstacles_of_live_depth() -> None:
     assert bench.age_s(seen) > 1.0
     assert seen.obstacles is not None
     assert seen.obstacles.captured_ns == bench.now_ns
+
+
+@pytest.mark.parametrize("detector", [True, False])
+def test_a_source_whose_frames_stop_is_named(detector: bool) -> None:
+    settings = Settings(detector=DetectorSection(enabled=detector))
+    camera = PerceptionCamera(settings)
+    what = "result" if detector else "frame"
+    assert camera.blind(START_NS) == f"no {what} yet"
+    for index in range(5):
+        found = Detections.empty(("car",) if detector else ())
+        camera.update(PerceptionResult(index, START_NS + index * PERIOD_NS, START_NS, 640, 480, found, {}, 0))
+    newest_ns = START_NS + 4 * PERIOD_NS
+    assert not camera.blind(newest_ns + 10**9)
+    assert camera.blind(newest_ns + 10**10) == f"no {what} for 10.0 s"
