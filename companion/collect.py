@@ -28,6 +28,7 @@ from companion.settings import ZenohSection
 from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
 from vision.evaluation.datasets import fold_name
 from vision.plain_yaml import load_plain_yaml
+from vision.text_file import read_text
 
 DOUBTED, LOST, CHANGED = "doubted", "lost", "changed class"
 # The last of every five parts of a flight is for validation. At its ends nothing is kept: these images would
@@ -104,7 +105,7 @@ class LabelFolder:
         self._text, self._names = "train: images/train\nnames: []\n", list[str]()
         self._splits: dict[str, Any] = {"train": "images/train"}
         if self._file.is_file():
-            self._text = self._file.read_bytes().decode("utf-8")
+            self._text = read_text(self._file)
             table = load_plain_yaml(self._text)
             names = table.get("names") if isinstance(table, dict) else None
             if not isinstance(names, list):

@@ -158,6 +158,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.gc_pause",
     "vision.rotation",
     "vision.shared_frame",
+    "vision.text_file",
 }
 MAY_IMPORT_SIMULATOR = {"sim_session", "demo", "play", "train", "train_policy", "bench", "models"}
 

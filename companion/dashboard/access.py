@@ -13,6 +13,7 @@ import ipaddress
 import os
 import socket
 import stat
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
@@ -67,7 +68,7 @@ def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
         check_private(path, status)
     except KeyFileError as error:
         raise DashboardError(f"{name} {error}") from None
-    token = content.decode("ascii", "replace").strip()
+    token = content.removeprefix(BOM_UTF8).decode("ascii", "replace").strip()
     if len(content) > _LONGEST_FILE_BYTES or not token.isprintable() or " " in token or "\ufffd" in token:
         raise DashboardError(f"{name} {path}: expected one line of ASCII without spaces")
     if len(token) < SHORTEST_TOKEN:

@@ -15,6 +15,7 @@ from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 from vision.extras import install_command
 from vision.file_kinds import kind_of_bytes
+from vision.text_file import decode_text
 
 if TYPE_CHECKING:
     import httpx
@@ -83,7 +84,7 @@ def read_api_key(path: Path) -> str:
         content = path.read_bytes()
         if (kind := kind_of_bytes(content)) is not None:
             raise LanguageError(f"language.key_file {path}: {kind}")
-        return content.decode("utf-8").strip()
+        return decode_text(content).strip()
     except KeyFileError as error:
         raise LanguageError(f"language.key_file {error}") from None
     except OSError as error:

@@ -17,6 +17,7 @@ from vision.file_kinds import explained
 from vision.marker_boards import MAP, Board, ned_from_marker
 from vision.markers import square
 from vision.rotation import matrix_from_euler
+from vision.text_file import read_text
 
 _Number = Annotated[float, Field(strict=False, ge=-10_000, le=10_000)]
 _Vector = Annotated[list[_Number], Field(min_length=3, max_length=3)]
@@ -135,12 +136,11 @@ def _board(
 
 def _read(path: str | Path, kind: type[_Kind]) -> _Kind:
     try:
-        content: dict[str, Any] = parse_toml(Path(path).read_bytes().decode("utf-8"))
+        content: dict[str, Any] = parse_toml(read_text(Path(path)))
     except OSError as error:
         raise BoardError(f"{path}: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        problem = f"{path}: not UTF-8 text, which TOML must be (byte {error.start})"
-        raise BoardError(explained(Path(path), problem)) from error
+        raise BoardError(explained(Path(path), f"{path}: {error}")) from error
     except tomllib.TOMLDecodeError as error:
         raise BoardError(explained(Path(path), f"{path}: not TOML: {error}")) from error
     try:

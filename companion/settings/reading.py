@@ -33,6 +33,7 @@ from companion.settings.section import Section
 from companion.settings.settings import Settings
 from companion.toml_text import parse_toml
 from vision.file_kinds import explained
+from vision.text_file import read_text
 
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
 
@@ -284,13 +285,11 @@ class _Reading:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return parse_toml(path.read_bytes().decode("utf-8"))
+        return parse_toml(read_text(path))
     except OSError as error:
         raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        problem = f"{path}, line {line}: not UTF-8 text, which TOML must be"
-        raise ConfigurationError(explained(path, problem)) from error
+        raise ConfigurationError(explained(path, f"{path}: {error}")) from error
     except tomllib.TOMLDecodeError as error:
         reason, _, position = str(error).rpartition(" (at ")
         problem = f"{path}, {position.removesuffix(')')}: {reason}"

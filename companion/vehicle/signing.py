@@ -18,6 +18,7 @@ from companion.key_files import KeyFileError, check_private
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
 from vision.file_kinds import kind_of_bytes
+from vision.text_file import decode_text
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ def read_key(path: str | Path) -> bytes:
     if content and (kind := kind_of_bytes(content)) is not None:
         raise SigningKeyError(f"signing key {path}: {kind}")
     try:
-        passphrase = content.decode("utf-8").strip()
+        passphrase = decode_text(content).strip()
     except UnicodeDecodeError:
         passphrase = ""
     if not passphrase or "\0" in passphrase:

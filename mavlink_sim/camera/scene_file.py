@@ -35,6 +35,7 @@ from mavlink_sim.world.world import (
     demo_world,
 )
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
+from vision.text_file import read_text
 
 
 class SceneError(ValueError):
@@ -218,9 +219,9 @@ def load_scene(file: str | FilePath) -> Scene:
         text = (resources.files("mavlink_sim") / "scenes" / f"{file}.toml").read_text("utf-8")
         return parse_scene(text, str(file))
     try:
-        text = path.read_bytes().decode("utf-8")
+        text = read_text(path)
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: not UTF-8 text, which TOML must be (byte {error.start})") from error
+        raise SceneError(f"{path}: {error}") from error
     except OSError as error:
         known = ", ".join(example_scenes())
         raise SceneError(

@@ -19,6 +19,7 @@ from vision.depth_registration import DepthCalibration
 from vision.file_kinds import explained
 from vision.home import expanded
 from vision.orientation import Orientation
+from vision.text_file import read_text
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
@@ -143,7 +144,7 @@ def read_camera_info(path: Path) -> CameraInfo:
     from vision.calibration.foreign_files import load_calibration
 
     try:
-        content = load_calibration(path.read_bytes().decode("utf-8"))
+        content = load_calibration(read_text(path))
         model = _lens(content)
         name = str(content.get("camera_name") or "")
         known = None if name in ("", *_DEFAULT_NAMES) else name

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from vision.file_kinds import explained
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
+from vision.text_file import read_text
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 _TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
@@ -178,9 +179,11 @@ def _looks_like_coco(path: Path) -> bool:
 def read_coco(path: Path, images: Path | None = None) -> Dataset:
     """Read the data set of one annotation file; raises `DatasetError` naming the entry."""
     try:
-        content = json.loads(path.read_bytes())
+        content = json.loads(read_text(path))
     except OSError as error:
         raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path}: {error}") from None
     except (ValueError, RecursionError) as error:
         raise DatasetError(explained(path, f"{path}: is not JSON ({error})")) from None
     if not isinstance(content, dict):
@@ -325,7 +328,7 @@ def _check_labels_have_images(images: list[Path], root: Path) -> None:
 
 def _read_table(path: Path) -> dict[Any, Any]:
     try:
-        table = load_plain_yaml(path.read_text(encoding="utf-8"))
+        table = load_plain_yaml(read_text(path))
     except (PlainYamlError, UnicodeDecodeError) as error:
         raise DatasetError(explained(path, f"{path}: {error}")) from None
     if not isinstance(table, dict) or not table.keys() & {"names", "nc", "path", *_SPLITS}:
@@ -364,7 +367,7 @@ def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Pat
         if where.is_dir():
             found += image_files(where)
         elif where.is_file() and where.suffix == ".txt":
-            lines = where.read_text(encoding="utf-8").splitlines()
+            lines = read_text(where).splitlines()
             found += [
                 _listed(line.strip(), base, where, number)
                 for number, line in enumerate(lines, 1)
@@ -401,9 +404,9 @@ def _sample(image: Path, root: Path, names: tuple[str, ...] | None) -> Sample:
     if path.stat().st_size > _LARGEST_LABELS_BYTES:
         raise DatasetError(f"{path}: has {path.stat().st_size} bytes, too many for a label file")
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except UnicodeDecodeError:
-        raise DatasetError(f"{path}: is not UTF-8 text") from None
+        lines = read_text(path).splitlines()
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"{path}: {error}") from None
     boxes: list[NDArray[np.float64]] = []
     class_ids: list[int] = []
     for number, line in enumerate(lines, 1):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from vision.text_file import read_text
+
 _LARGEST_BYTES = 1 << 20
 # The 80 classes of COCO's detection task in the order of their ids; the number is the id of 1..90.
 _COCO = """1 person,2 bicycle,3 car,4 motorcycle,5 airplane,6 bus,7 train,8 truck,9 boat,10 traffic light,
@@ -57,11 +59,11 @@ def _names_in(path: Path) -> tuple[str, ...]:
     try:
         if (size := path.stat().st_size) > _LARGEST_BYTES:
             raise NamesError(f"{path}: has {size} bytes, the limit is {_LARGEST_BYTES}")
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+        lines = read_text(path).splitlines()
     except OSError as error:
         raise NamesError(f"{path}: cannot be read ({error.strerror or error})") from None
     except UnicodeDecodeError as error:
-        raise NamesError(f"{path}: is not UTF-8 (byte {error.start}); expected one name a line") from None
+        raise NamesError(f"{path}: {error}; expected one name a line") from None
     names = tuple(line.strip() for line in lines if line.strip())
     for name in names:
         if not name.isprintable():

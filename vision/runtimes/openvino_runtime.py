@@ -16,6 +16,7 @@ from vision.runtimes import base
 from vision.runtimes.base import Precision, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import KEY, SUFFIXES, ExportedFacts, own_facts
 from vision.runtimes.load_trial import check_load
+from vision.text_file import read_text
 from vision.yolo.level_outputs import Head, LevelOutput, Product
 
 _HINTS = {"float32": "f32", "bfloat16": "bf16", "float16": "f16"}
@@ -166,7 +167,7 @@ def _stated(path: Path, model: Any) -> dict[str, Any]:
     try:
         if beside.stat().st_size > _LARGEST_METADATA_BYTES:
             raise PlainYamlError(f"has more than {_LARGEST_METADATA_BYTES} bytes")
-        stated = load_plain_yaml(beside.read_text(encoding="utf-8"))
+        stated = load_plain_yaml(read_text(beside))
     except (PlainYamlError, UnicodeDecodeError, OSError) as error:
         raise RuntimeUnusableError(f"{beside}: cannot be read ({error})") from None
     return {str(key): value for key, value in stated.items()} if isinstance(stated, dict) else {}

@@ -17,6 +17,7 @@ from safetensors import SafetensorError, safe_open
 
 from vision.file_kinds import explained
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
+from vision.text_file import read_text
 from vision.yolo.safe_pickle import CheckpointError, one_line
 
 if TYPE_CHECKING:
@@ -128,15 +129,15 @@ def _read_description(path: Path, weights_path: Path) -> dict[str, Any]:
         size = path.stat().st_size
         if size > _LARGEST_DESCRIPTION_BYTES:
             raise CheckpointError(f"{path}: has {size} bytes, the limit is {_LARGEST_DESCRIPTION_BYTES}")
-        table = load_plain_yaml(path.read_bytes().decode("utf-8"))
+        table = load_plain_yaml(read_text(path))
     except FileNotFoundError:
         raise CheckpointError(
             f"{path}: no such file; {weights_path.name} needs it beside it, as the description of the weights"
         ) from None
     except OSError as error:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from None
-    except UnicodeDecodeError:
-        raise CheckpointError(explained(path, f"{path}: is not UTF-8 text")) from None
+    except UnicodeDecodeError as error:
+        raise CheckpointError(explained(path, f"{path}: {error}")) from None
     except PlainYamlError as error:
         raise CheckpointError(one_line(explained(path, f"{path}: {error}"))) from None
     if not isinstance(table, dict):

@@ -49,6 +49,7 @@ from companion.guidance.missions.sequence import (
 from companion.guidance.search_pattern import Footprint
 from companion.toml_text import parse_toml
 from vision.file_kinds import explained, kind_of_text
+from vision.text_file import read_text
 
 MISSIONS_FOLDER = Path(__file__).parent
 LARGEST_BYTES = 100_000
@@ -149,11 +150,11 @@ def read_mission(path: Path) -> str:
         size = path.stat().st_size
         if size > LARGEST_BYTES:
             raise MissionError(f"{path}: a mission has at most {LARGEST_BYTES} bytes, this file has {size}")
-        return path.read_text(encoding="utf-8")
+        return read_text(path)
     except OSError as error:
-        raise MissionError(f"{path}: cannot be read: {error.strerror}") from error
+        raise MissionError(f"{path}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:
-        raise MissionError(explained(path, f"{path}: cannot be read: {error}")) from error
+        raise MissionError(explained(path, f"{path}: {error}")) from error
 
 
 def plan_from(

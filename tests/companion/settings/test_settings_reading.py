@@ -261,7 +261,13 @@ def test_binary_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_bytes(b"[log]\nlevel = '\xff'\n")
     (line,) = problems(path)
-    assert line.startswith(f"{path}, line 2: not UTF-8 text")
+    assert line.startswith(f"{path}: is not UTF-8 text (line 2,")
+
+
+def test_byte_order_mark_is_no_part_of_the_settings(tmp_path: Path) -> None:
+    path = tmp_path / "c.toml"
+    path.write_text("[vehicle]\nname = 'v2'\n", "utf-8-sig")
+    assert load_settings(path).vehicle.name == "v2"
 
 
 def test_missing_file_is_reported(tmp_path: Path) -> None:

@@ -1,0 +1,47 @@
+"""Text files that people write, as every reader of one gets them."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from vision.text_file import NotUtf8Error, read_text
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_byte_order_mark_is_no_part_of_the_text(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "names.txt").write_text("Fußgänger\n", encoding)
+    assert read_text(tmp_path / "names.txt") == "Fußgänger\n"
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [("a".encode("utf-16"), "UTF-16"), (b"\xfe\xff\0a", "UTF-16"), (b"ok\nFu\xdfg", "line 2")],
+)
+def test_another_encoding_is_named(tmp_path: Path, data: bytes, words: str) -> None:
+    (tmp_path / "names.txt").write_bytes(data)
+    with pytest.raises(NotUtf8Error) as caught:
+        read_text(tmp_path / "names.txt")
+    assert words in str(caught.value)
+    assert "save it as UTF-8" in str(caught.value)
+
+
+def test_text_files_are_read_in_one_place() -> None:
+    """`read_text("utf-8")` and `read_bytes().decode("utf-8")` elsewhere would keep the byte order mark."""
+    found = []
+    for package in ("companion", "vision", "mavlink_sim"):
+        for path in (ROOT / package).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                    continue
+                words = ast.unparse(node)
+                decodes = node.func.attr == "decode" and ".read_bytes()" in words
+                reads = node.func.attr == "read_text" and "encoding='utf-8'" in words
+                if (decodes or reads) and "resources.files" not in words:
+                    found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    # A device tree is the kernel's.
+    assert [place for place in found if "stored_choice" not in place] == []
