@@ -36,6 +36,9 @@ IDENTITY_S, IDENTITY_FRAMES = 0.5, 4
 OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 # Two boxes within this bearing may both be the object.
 SAME_BEARING_RAD = 0.03
+# A confirmed track without a rival has manoeuvred if the filter has refused its detections this many times in
+# a row while they fit each other: the filter restarts there.
+REFUSED = 3
 
 
 class _OcclusionHypothesis(NamedTuple):
@@ -61,6 +64,7 @@ class MovingTrack:
         self._others: set[int] = set()
         self._occlusion: _OcclusionHypothesis | None = None
         self._intervals_s: deque[float] = deque(maxlen=5)
+        self._refused: list[tuple[Target, Vector3]] = []
 
     @property
     def captured_ns(self) -> int:
@@ -110,7 +114,8 @@ class MovingTrack:
         fitting = [fit for target in fresh if (fit := expected.fit(target, vehicle)).squared <= GATE]
         own = self._own(fitting, unseen_s)
         if own is None:
-            return False
+            return self._manoeuvred(fresh, fitting, unseen_s, vehicle)
+        self._refused = []
         surely = own.target.track_id == self._track_id and own.squared <= EXPECTED_GATE
         if (
             self._occlusion is None
@@ -137,7 +142,7 @@ class MovingTrack:
         """The detection inside the gate that is the object; None: none, or ambiguous."""
         # The image tracker's id has priority, unless it has switched to where the object cannot be, or after
         # an occlusion.
-        believed = unseen_s <= max(IDENTITY_S, IDENTITY_FRAMES * self._interval_s)
+        believed = self._believes_id(unseen_s)
         fits = [
             fit for fit in fitting if self._track_id is not None and fit.target.track_id == self._track_id
         ]
@@ -150,6 +155,40 @@ class MovingTrack:
         if not fits or (len(fits) > 1 and fits[1].squared < CLEARLY_NEARER * max(fits[0].squared, AS_GOOD)):
             return None
         return fits[0]
+
+    def _believes_id(self, unseen_s: float) -> bool:
+        """Whether the object was seen so lately that the image tracker's id is still its own."""
+        return unseen_s <= max(IDENTITY_S, IDENTITY_FRAMES * self._interval_s)
+
+    def _manoeuvred(
+        self, fresh: Sequence[Target], fitting: Sequence[Fit], unseen_s: float, vehicle: Vector3
+    ) -> bool:
+        """Restart where the image tracker sees the object, if the filter has refused it several times.
+
+        The filter expects a bounded acceleration; an object that turns or stops at once leaves its gate. The
+        image tracker has not lost it, so the filter is wrong, unless there is a rival inside the gate.
+        """
+        own = next((t for t in fresh if t.track_id is not None and t.track_id == self._track_id), None)
+        if (
+            own is None
+            or not own.trusted
+            or own.position_ned_m is None
+            or not (self._refused or self._believes_id(unseen_s))
+            or any(self._may_be_it(fit.target) for fit in fitting)
+        ):
+            self._refused = []
+            return False
+        if any(
+            Estimate.initialize(target, seen_from).at(own.captured_ns).fit(own, vehicle).squared > GATE
+            for target, seen_from in self._refused
+        ):
+            self._refused = []
+        self._refused.append((own, vehicle))
+        if len(self._refused) < REFUSED:
+            return False
+        self._estimate, self._newest = Estimate.initialize(own, vehicle), own
+        self._refused, self._occlusion = [], None
+        return True
 
     def _may_be_it(self, target: Target) -> bool:
         """Whether a new track id may be this object: it is trusted and has a position."""

@@ -109,6 +109,39 @@ def test_returning_id_far_from_prediction_is_rejected(road: Road) -> None:
     assert road.off_m < 0.5
 
 
+@pytest.mark.parametrize("turn_deg", [90.0, -90.0, 180.0])
+def test_own_id_without_a_rival_is_followed_in_a_turn(road: Road, turn_deg: float) -> None:
+    corner, turn = road.car, math.radians(turn_deg)
+
+    def car(seconds: float) -> tuple[float, float]:
+        return (
+            corner[0] + SPEED_MPS * seconds * math.cos(turn),
+            corner[1] + SPEED_MPS * seconds * math.sin(turn),
+        )
+
+    for index in range(1, 31):
+        road.seconds += FRAME_S
+        road.track.update([seen(car(FRAME_S * index), (*corner, -4.0), road.seconds, 1)], (*corner, -4.0))
+    now_ns = round(road.seconds * 1e9)
+    assert road.track.captured_ns == now_ns
+    assert math.dist(road.track.position_at(now_ns), car(3.0)) < 0.5
+    assert math.dist(road.track.velocity, (SPEED_MPS * math.cos(turn), SPEED_MPS * math.sin(turn))) < 0.6
+
+
+def test_own_id_far_off_is_refused_beside_a_rival(road: Road) -> None:
+    road.see(1.0, id1=(-4.0, 4.0), id37=(0.0, 0.0))
+    assert road.track.track_id == 37
+    assert road.off_m < 0.3
+
+
+def test_single_wrong_ranges_do_not_restart_the_filter(road: Road) -> None:
+    for _ in range(10):
+        road.see(0.2, id1=(6.0, 0.0))
+        assert road.off_m < 0.5
+        road.see(0.3, id1=(0.0, 0.0))
+    assert road.off_m < 0.3
+
+
 def test_short_gap_at_the_prediction_is_no_occlusion(road: Road) -> None:
     road.see(0.4)
     road.see(0.4, id1=(0.0, 0.0))
