@@ -17,8 +17,8 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.driver import LinkError
-from companion.vehicle.framing import frames_of
 from companion.vehicle.link_url import LinkScheme, LinkUrl, parse_link_url
+from companion.vehicle.reception import Reception
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S
 from companion.vehicle.vehicle_type import AUTOPILOT_NAMES, MULTICOPTERS, autopilot_text, type_text
 
@@ -52,6 +52,7 @@ class Relay:
         self.url = url
         self.heartbeat: AutopilotHeartbeat | None = None
         self.others: set[Source] = set()
+        self._reception = Reception()
         self._source: Source = None
         self._received_s = 0.0
         self._checked = False
@@ -120,7 +121,7 @@ class Relay:
     def _from_vehicle(self, data: bytes, source: Source) -> None:
         # The checked autopilot's messages are not parsed, which would delay them.
         known = source == self._source and self._checked
-        heartbeat = None if known else _heartbeat_in(data)
+        heartbeat = None if known else self._heartbeat_in(data, source)
         if heartbeat is not None and source != self._source:
             self._on_new_sender(source, heartbeat)
         if source != self._source:
@@ -157,15 +158,14 @@ class Relay:
         if self._vehicle is not None:
             self._vehicle.send(data)
 
-
-def _heartbeat_in(data: bytes) -> AutopilotHeartbeat | None:
-    """Return an autopilot's heartbeat in a datagram; None if there is none."""
-    for frame in frames_of(data):
-        if (
-            frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
-            and frame.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
-        ):
-            _, vehicle_type, autopilot, base_mode, _, _ = _HEARTBEAT.unpack(frame.padded(_HEARTBEAT.size))
-            if autopilot != mavlink.MAV_AUTOPILOT_INVALID:
-                return AutopilotHeartbeat(frame.system_id, vehicle_type, autopilot, base_mode)
-    return None
+    def _heartbeat_in(self, data: bytes, source: Source) -> AutopilotHeartbeat | None:
+        """Return an autopilot's heartbeat that a datagram completes; None if there is none."""
+        for frame in self._reception.feed(data, source, datagram=True, keep=self._source):
+            if (
+                frame.message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT
+                and frame.component_id == mavlink.MAV_COMP_ID_AUTOPILOT1
+            ):
+                _, vehicle_type, autopilot, base_mode, _, _ = _HEARTBEAT.unpack(frame.padded(_HEARTBEAT.size))
+                if autopilot != mavlink.MAV_AUTOPILOT_INVALID:
+                    return AutopilotHeartbeat(frame.system_id, vehicle_type, autopilot, base_mode)
+        return None

@@ -57,7 +57,7 @@ def status_message(
         now_ns: CLOCK_MONOTONIC. steering: the camera that guidance uses. others: services that command the
             same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
-    state, limits = driver.state, guidance.limits
+    state, limits, received = driver.state, guidance.limits, driver.reception
     has_vehicle = any(part["name"] == "autopilot" for part in parts)
     silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
     return {
@@ -87,6 +87,12 @@ def status_message(
             },
             "without_service": without_service_text(state, parameters, has_vehicle=has_vehicle),
             "missing_streams": list(state.missing_streams),
+            "reception": {
+                "frames": received.frames,
+                "split": received.split,
+                "lost": received.lost,
+                "skipped_bytes": received.skipped_bytes,
+            },
             "status_texts": [report.text for report in state.reports],
             "other_commanders": others,
         },

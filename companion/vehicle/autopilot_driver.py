@@ -28,7 +28,7 @@ from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
 from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame, Framer, is_signed, pack_frame
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim, address_text
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.harmless import are_harmless
@@ -37,6 +37,7 @@ from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.obstacle_distance import obstacle_distance_fields
 from companion.vehicle.own_address import LISTEN_JITTER_S, LISTEN_S, OwnAddress
+from companion.vehicle.reception import Reception, ReceptionCounts
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
 from companion.vehicle.setpoint_echo import NAME as ECHO_NAME
@@ -130,7 +131,7 @@ class AutopilotDriver(ABC):
 
     def _reset(self) -> None:
         self._telemetry.reset()
-        self._framer = Framer()
+        self._reception = Reception()
         self._system_id: int | None = None
         self._autopilot_kind: int | None = None
         self._source: Source = None
@@ -293,7 +294,7 @@ class AutopilotDriver(ABC):
             wanted_system_id=self._wanted_system_id,
             others=self._others,
             signer=self._signer,
-            skipped_bytes=self._framer.skipped_bytes,
+            skipped_bytes=self._reception.counts.skipped_bytes,
         )
 
     def _prompt(self) -> None:
@@ -348,7 +349,7 @@ class AutopilotDriver(ABC):
         if self._on_bytes is not None:
             self._on_bytes(False, data)
         ours: list[Frame] = []
-        for frame in self._framer.feed(data, datagram=link.datagrams):
+        for frame in self._reception.feed(data, source, datagram=link.datagrams, keep=self._source):
             if self._signer is not None and not self._signer.accepts(frame):
                 if self._signer.peer_late and self._source is None:
                     self._send_signed_time(source)
@@ -361,6 +362,7 @@ class AutopilotDriver(ABC):
                     self._commander_from(frame, source, ONBOARD_CONTROLLER, value)
             if frame.system_id == self._system_id and source == self._source:
                 if frame.component_id == AUTOPILOT_COMPONENT:
+                    self._reception.autopilot(frame)
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
                     # PX4 signs what it sends, and still accepts unsigned messages.
                     self._signs |= is_signed(frame.raw)
@@ -400,7 +402,7 @@ class AutopilotDriver(ABC):
         """See Driver. The autopilot's heartbeat counts as lost until the next one."""
         if self._link is not None:
             self._link.discard_received()
-        self._framer = Framer()
+        self._reception.discard_received()
         self._telemetry.discard_received()
 
     def _send_signed_time(self, source: Source) -> None:
@@ -532,6 +534,11 @@ class AutopilotDriver(ABC):
         if sender not in self._others and len(self._others) < _MOST_OTHERS:
             self._others.add(sender)
             logger.info("%s: " + text, self.url, *sender)
+
+    @property
+    def reception(self) -> ReceptionCounts:
+        """See Driver."""
+        return self._reception.counts
 
     @property
     def state(self) -> VehicleState:

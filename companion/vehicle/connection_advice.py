@@ -9,6 +9,7 @@ from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.signing import FrameSigner
 from companion.vehicle.vehicle_type import ARDUPILOT
 
+_UDP = (LinkScheme.UDP_IN, LinkScheme.UDP_OUT)
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 
 
@@ -39,7 +40,8 @@ def no_autopilot_text(
         advice = f"its frames failed the signature check ({reasons}); both ends need the same key"
     elif skipped_bytes:
         count = "" if timeout_s is None else f"{skipped_bytes} "
-        advice = f"received {count}bytes that are not MAVLink; check the baud rate and the device"
+        check = "what sends to this port" if url.scheme in _UDP else "the baud rate and the device"
+        advice = f"received {count}bytes that are not MAVLink; check {check}"
     elif url.scheme is LinkScheme.UDP_IN:
         advice = "nothing received; check that the vehicle is on and sends to this address and port"
     else:

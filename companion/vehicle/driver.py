@@ -14,6 +14,7 @@ from companion.clock import StandstillWatch
 from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
+from companion.vehicle.reception import ReceptionCounts
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState
 from companion.vehicle.vision_position import VisionPosition
@@ -91,6 +92,10 @@ class Driver(Protocol):
 
         0 until `connect` has found the autopilot.
         """
+
+    @property
+    def reception(self) -> ReceptionCounts:
+        """How many frames were received, split over datagrams, and lost, since the link was opened."""
 
     @property
     def state(self) -> VehicleState:

@@ -57,33 +57,77 @@ class Frame:
 
 
 class Framer:
-    """Splits a stream of bytes into frames. Resynchronises at the next magic byte after an error."""
+    """Splits the bytes of one sender into frames. Resynchronises at the next magic byte after an error.
+
+    Attributes:
+        skipped_bytes: that are in no frame.
+        split_frames: that began in one datagram and ended in another.
+        has_framed: a frame with a right checksum has been received.
+    """
 
     def __init__(self) -> None:
         self._tail = b""
-        self.skipped_bytes = 0
+        self.skipped_bytes = self.split_frames = 0
+        self.has_framed = False
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Number of bytes that may begin a frame: less than the longest one."""
+        return len(self._tail)
 
     def feed(self, data: bytes, *, datagram: bool) -> list[Frame]:
-        """Return the frames that `data` completes. A frame never spans two datagrams."""
-        buffer = data if datagram else self._tail + data
+        """Return the frames that `data` completes; the rest waits for what follows.
+
+        Of datagrams that were never seen to split a frame, whole frames up to the end are not held back by a
+        false or damaged header before them.
+        """
+        held = len(self._tail)
+        return self._read(self._tail + data, held if datagram else None, whole=not self.split_frames)
+
+    def flush(self) -> list[Frame]:
+        """Return the whole frames of what waits, and skip the rest: nothing will complete it."""
+        frames = self._read(self._tail, 0, whole=True, final=True)
+        self._tail = b""
+        return frames
+
+    def _read(self, buffer: bytes, held: int | None, *, whole: bool, final: bool = False) -> list[Frame]:
+        """Read frames, and keep the rest.
+
+        Args:
+            held: bytes of earlier datagrams at the start of `buffer`; None: of a stream.
+            whole: no frame was split yet. final: nothing follows.
+        """
+        whole &= held is not None
         frames: list[Frame] = []
         position = 0
         while position < len(buffer):
             length = _frame_length(buffer, position)
             if length is None:  # more bytes may make it a frame
-                if not datagram:
+                start = _whole_frames_after(buffer, position) if whole else None
+                if start is None and not final:
                     break
-                length = 0
+                start = position + 1 if start is None else start
+                self.skipped_bytes += start - position
+                position = start
+                continue
             frame = _read_frame(buffer[position : position + length]) if length else None
-            # Without a checksum, noise that looks like a header must not consume the frames that follow.
-            following = buffer[position + length : position + length + 1]
-            if frame is None or not (frame.checked or not following or following[0] in _MAGICS):
+            if frame is not None and not frame.checked:
+                # Without a checksum, noise that looks like a header must not consume the frames that follow.
+                following = buffer[position + length : position + length + 1]
+                if not following and held is not None and not final and not (whole and position >= held):
+                    break  # where frames are split, the end of a datagram is not that of a frame
+                if following and following[0] not in _MAGICS:
+                    frame = None
+            if frame is None:
                 self.skipped_bytes += 1
                 position += 1
                 continue
             frames.append(frame)
+            self.has_framed |= frame.checked
+            if held is not None and frame.checked and position < held < position + length:
+                self.split_frames += 1
             position += length
-        self._tail = b"" if datagram else buffer[position:]
+        self._tail = buffer[position:]
         return frames
 
 
@@ -119,8 +163,24 @@ def marked_signed(raw: bytes) -> bytes:
 
 
 def frames_of(data: bytes) -> Iterator[Frame]:
-    """Yield the frames of one datagram."""
-    yield from Framer().feed(data, datagram=True)
+    """Yield the whole frames of one datagram of a program that does not split them."""
+    framer = Framer()
+    yield from framer.feed(data, datagram=True)
+    yield from framer.flush()
+
+
+def _whole_frames_after(buffer: bytes, position: int) -> int | None:
+    """Where, after `position`, checked frames begin that last exactly until the end; None: nowhere."""
+    for start in range(position + 1, len(buffer)):
+        end = start
+        while end < len(buffer) and (length := _frame_length(buffer, end)):
+            frame = _read_frame(buffer[end : end + length])
+            if frame is None or not frame.checked:
+                break
+            end += length
+        if start < end == len(buffer):
+            return start
+    return None
 
 
 def _frame_length(buffer: bytes, position: int) -> int | None:

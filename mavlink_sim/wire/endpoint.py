@@ -146,6 +146,8 @@ logger = logging.getLogger(__name__)
 PEER_SILENCE_S = 5.0
 # A socket buffer's worth of full-size datagrams; more in one go means a client that floods us.
 MAX_DATAGRAMS_PER_READ = 200
+# Whose split frames are put together; the one that has been silent longest is forgotten.
+MAX_SENDERS = 16
 
 
 class PortInUseError(OSError):
@@ -178,6 +180,7 @@ class UdpEndpoint:
         self.peer: tuple[str, int] = (host, peer_port)
         self._peer_seen_s: float | None = None
         self._codec = parser(system_id)
+        self._readers: dict[Address, Any] = {}
         self.signing = Signing()
         self._refused = False
         self.on_packet: Callable[[bytes], None] | None = None
@@ -206,7 +209,7 @@ class UdpEndpoint:
                 continue  # an ICMP answer to an earlier datagram: no listener there now
             found = [
                 message
-                for message in self._codec.parse_buffer(datagram) or []
+                for message in self._reader_of(sender).parse_buffer(datagram) or []
                 if message.get_type() != "BAD_DATA" and self.signing.accepts(message.get_msgbuf())
             ]
             if found:
@@ -216,6 +219,16 @@ class UdpEndpoint:
                     for message in found:
                         self.on_packet(bytes(message.get_msgbuf()))
         return messages
+
+    def _reader_of(self, sender: Address) -> Any:
+        """The sender's own parser: a frame may be cut over its datagrams, between those of others."""
+        reader = self._readers.pop(sender, None)
+        if reader is None:
+            if len(self._readers) >= MAX_SENDERS:
+                del self._readers[next(each for each in self._readers if each != self.peer)]
+            reader = parser()
+        self._readers[sender] = reader  # the newest last
+        return reader
 
     def _note_sender(self, sender: tuple[str, int]) -> None:
         now = time.monotonic()

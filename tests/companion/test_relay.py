@@ -104,6 +104,13 @@ async def test_messages_reach_both_programs_and_come_back() -> None:
             assert ends.autopilots[0].recvfrom(2048) == (b"from a program", ends.relay.url.address)
 
 
+async def test_an_autopilot_that_splits_its_frames_is_found() -> None:
+    async with opened() as ends:
+        for start in range(0, len(heartbeat()), 12):
+            ends.send(heartbeat()[start : start + 12])
+        assert (await ends.relay.check_autopilot()).system_id == 1
+
+
 async def test_nothing_is_sent_before_an_autopilot_heartbeat() -> None:
     async with opened() as ends:
         ends.send(b"no heartbeat")

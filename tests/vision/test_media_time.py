@@ -41,7 +41,7 @@ STAMPS_MS = {
 }
 
 
-@pytest.fixture(params=STAMPS_MS.values(), ids=STAMPS_MS.keys())
+@pytest.fixture(params=list(STAMPS_MS.values()), ids=list(STAMPS_MS))
 def stamped(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return write_stamped_video(tmp_path / "stamped.mkv", request.param)
 

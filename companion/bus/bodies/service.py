@@ -41,6 +41,19 @@ class StatusSilenceBody(TypedDict):
     """one sentence"""
 
 
+class StatusReceptionBody(TypedDict):
+    """Received MAVLink frames since the link was opened."""
+
+    frames: int
+    """of the autopilot"""
+    split: int
+    """put together from several datagrams"""
+    lost: int
+    """missing in the autopilot's sequence numbers"""
+    skipped_bytes: int
+    """in no frame: not MAVLink, damaged, or rests of lost datagrams"""
+
+
 class StatusVehicleBody(TypedDict):
     """The link to the vehicle."""
 
@@ -70,6 +83,8 @@ class StatusVehicleBody(TypedDict):
     """what the vehicle does if the service ends now, one sentence"""
     missing_streams: list[str]
     """required messages that arrive at less than half their rate"""
+    reception: StatusReceptionBody
+    """frames received, split and lost"""
     status_texts: list[str]
     """the autopilot's last 20 texts, newest last"""
     other_commanders: list[OtherCommanderBody]

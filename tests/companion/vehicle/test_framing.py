@@ -68,10 +68,11 @@ def test_corrupt_byte_loses_only_its_frame(at: int, flip: int) -> None:
     assert HEARTBEAT in found
 
 
-def test_frame_never_spans_datagrams() -> None:
+def test_a_rest_does_not_hold_back_whole_frames() -> None:
     framer = Framer()
     assert framer.feed(POSITION[:20], datagram=True) == []
     assert [frame.raw for frame in framer.feed(HEARTBEAT, datagram=True)] == [HEARTBEAT]
+    assert framer.skipped_bytes == 20
 
 
 def test_headers_of_both_protocol_versions() -> None:
