@@ -53,7 +53,8 @@ def packed(count: int, kinds: list[str], text: bytes = b"\xfd\xfe") -> list[byte
 
 def cut(stream: bytes, sizes: list[int]) -> list[bytes]:
     """The stream in datagrams of these sizes, in turn."""
-    parts, position = [], 0
+    parts: list[bytes] = []
+    position = 0
     for size in itertools.cycle(sizes):
         if position >= len(stream):
             return parts
