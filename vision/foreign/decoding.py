@@ -14,6 +14,8 @@ from vision.yolo.postprocess import MOST_BOXES, Boxes, suppress
 
 Floats = NDArray[np.float32]
 
+_FARTHEST_FRACTION = 2.0  # a query's box may reach over the edge, but is no larger than twice the image
+
 
 def boxes_of(
     facts: ForeignFacts,
@@ -55,7 +57,7 @@ def boxes_of(
     if class_ids is not None:
         kept &= np.isin(class_id, class_ids)
     xyxy, score, class_id = xyxy[kept], score[kept], class_id[kept]
-    if facts.layout in ("cells", "objectness", "yolox"):
+    if facts.layout in ("cells", "rows", "objectness", "yolox"):
         order = suppress(xyxy, score, class_id, iou, MOST_BOXES)
     else:
         order = np.argsort(-score, kind="stable")[:MOST_BOXES]
@@ -64,7 +66,8 @@ def boxes_of(
 
 def _check_channels(facts: ForeignFacts, shape: tuple[int, ...], classes: int) -> None:
     """The file may state less than the shapes, or what it does not do."""
-    least = {"cells": 4 + classes, "selected": 6, "objectness": 5 + classes, "queries": 4 + classes}
+    plain = 4 + classes
+    least = {"cells": plain, "rows": plain, "selected": 6, "objectness": 1 + plain, "queries": plain}
     expected = least.get(facts.layout)
     if expected is None:
         return
@@ -91,6 +94,8 @@ def _best_of_rows(
             ((centred[:, :2] + cell[some]) * stride[some], np.exp(centred[:, 2:]) * stride[some]), axis=1
         )
     elif facts.layout == "queries":
+        if (np.abs(centred) > _FARTHEST_FRACTION).any():
+            raise ValueError(f"expected boxes in 0..1, got {np.abs(centred).max():.0f}, as of pixels")
         centred = centred * np.array([size[1], size[0]] * 2, np.float32)
     angle = found[:, 4 + classes] if facts.task == "obb" else None
     return _enclosing(centred, angle), best[some].astype(np.float32), class_id

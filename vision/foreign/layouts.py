@@ -7,7 +7,7 @@ state nothing; they are recognised by the names and shapes of their outputs.
 from __future__ import annotations
 
 import ast
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -17,9 +17,10 @@ from vision.letterbox import Placement
 from vision.plain_yaml import numbered
 from vision.runtimes.base import RuntimeUnusableError
 
-Layout = Literal["cells", "selected", "objectness", "yolox", "queries", "logits", "scored"]
+Layout = Literal["cells", "rows", "selected", "objectness", "yolox", "queries", "logits", "scored"]
 LAYOUTS: dict[Layout, str] = {
     "cells": "boxes and class probabilities of all cells, before NMS",
+    "rows": "boxes and class probabilities of all cells, transposed, before NMS",
     "selected": "boxes selected inside the file: iou has no effect",
     "objectness": "boxes, objectness and class probabilities of all cells, before NMS",
     "yolox": "boxes in cells, objectness and class probabilities, before NMS",
@@ -39,6 +40,15 @@ YOLOX_STRIDES = (8, 16, 32)
 YOLOX_SUFFIX = ".pth"
 # 1200 names of 40 characters; to parse one of 1 MiB takes seconds and 200 MB.
 _LONGEST_TEXT = 1 << 16
+# The parts of the names of Ultralytics' heads, `Segment26` or `v10Detect`, and the task of each.
+_HEADS = {
+    "RTDETR": "detect",
+    "Detect": "detect",
+    "Segment": "segment",
+    "Pose": "pose",
+    "OBB": "obb",
+    "Classify": "classify",
+}
 _IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
 
 
@@ -143,13 +153,16 @@ def recognise_by_metadata(path: Path, stated: Mapping[str, Any]) -> ForeignFacts
         size = [side if type(side) is int and 0 < side < 1 << 14 else None for side in sides]
     names = stated.get("names")
     channels = 4 + (len(names) if isinstance(names, dict | list) else 0)
+    more = _further_channels(task, stated, []) if (task := str(stated.get("task", "detect"))) in TASKS else 0
     if stated.get("end2end") or arguments.get("nms"):
-        output: tuple[int | None, ...] = (1, None, 6)
+        output: tuple[int | None, ...] = (1, None, None if more is None else 6 + more)
     elif "RTDETR" in str(stated.get("head", "")):
         output = (1, None, channels)
     else:
-        output = (1, channels, None)
-    return recognise(path, stated, [Port("image", (1, 3, *size))], [Port("output", output)])
+        output = (1, None if more is None else channels + more, None)
+    batch = stated.get("batch")
+    count = batch if type(batch) is int and not arguments.get("dynamic") else 1
+    return recognise(path, stated, [Port("image", (count, 3, *size))], [Port("output", output)])
 
 
 def _image_input(inputs: Sequence[Port]) -> Port:
@@ -173,12 +186,18 @@ def _ultralytics(
     task = str(stated.get("task", "detect"))
     if task not in TASKS:
         raise ValueError(f"is an export for {task!r:.40}; boxes come of {', '.join(TASKS)}")
+    head = str(stated.get("head", ""))
+    made_for = next((made for part, made in _HEADS.items() if part in head), task)
+    if made_for != task:
+        raise ValueError(f"states the task {task}, and the head {head:.40}, which is for {made_for}")
     names, stride = _class_names(stated["names"]), _literal(stated["stride"])
     if type(stride) is not int or not 1 <= stride <= 256:
         raise ValueError(f"states the stride {stride!r:.40}, expected a whole number of pixels")
+    _compare_input(stated, stride, image)
     arguments = _literal(stated.get("args", {}))
     arguments = arguments if isinstance(arguments, dict) else {}
-    selected = str(stated.get("end2end", "")) == "True" or bool(arguments.get("nms"))
+    ends = _literal(stated.get("end2end")), arguments.get("nms")
+    selected = True if any(ends) else False if ends == (False, False) else None
     precision = "float32"
     if image.dtype == "float16" or arguments.get("half") is True or arguments.get("quantize") == 16:
         precision = "float16"
@@ -186,7 +205,7 @@ def _ultralytics(
     quantised = stated.get("onnx.infer") == "onnxruntime.quant"
     if quantised or arguments.get("int8") is True or arguments.get("quantize") == 8:
         precision = "int8"
-    layout = _cell_layout(outputs, len(names), task, stated, selected=selected)
+    layout = _cell_layout(outputs, len(names), task, stated, selected, _is_cells(stride, fixed))
     known = {"licence": "license", "version": "version", "date": "date", "about": "description"}
     return ForeignFacts(
         names,
@@ -202,40 +221,106 @@ def _ultralytics(
     )
 
 
+def _compare_input(stated: Mapping[str, Any], stride: int, image: Port) -> None:
+    """What the metadata says about the input against its shape. Raises ValueError."""
+    channels, size = _literal(stated.get("channels", 3)), _literal(stated.get("imgsz"))
+    if type(channels) is int and channels != 3:
+        raise ValueError(f"states {channels} channels and takes {image}; an image has 3")
+    sides = [size, size] if type(size) is int else size if isinstance(size, list | tuple) else []
+    if len(sides) == 2 and any(
+        type(side) is int and found not in (side, None)
+        for side, found in zip(sides, image.shape[2:], strict=True)
+    ):
+        raise ValueError(f"states images of {sides[0]}x{sides[1]} pixels (imgsz), and takes {image}")
+    if any(found is not None and found % stride for found in image.shape[2:]):
+        raise ValueError(f"states the stride {stride}, and takes {image}: no multiples of it")
+
+
+def _is_cells(stride: int, fixed: tuple[int, int] | None) -> Callable[[int | None], bool | None]:
+    """Whether a length is the number of all cells of some levels, the coarsest of `stride`; None: unknown."""
+
+    def is_cells(length: int | None) -> bool | None:
+        if fixed is None or length is None:
+            return None
+        counts = {(fixed[0] // stride) * (fixed[1] // stride)}
+        finer = stride // 2
+        while finer >= 2:
+            counts |= {count + (fixed[0] // finer) * (fixed[1] // finer) for count in counts}
+            finer //= 2
+        return length in counts
+
+    return is_cells
+
+
 def _cell_layout(
-    outputs: Sequence[Port], classes: int, task: str, stated: Mapping[str, Any], *, selected: bool
+    outputs: Sequence[Port],
+    classes: int,
+    task: str,
+    stated: Mapping[str, Any],
+    selected: bool | None,
+    is_cells: Callable[[int | None], bool | None],
 ) -> Layout:
-    """The layout of an output of Ultralytics; tasks other than `detect` have further channels."""
+    """The layout of an output of Ultralytics, or of YOLOv5's and YOLOv9's repositories, which state no task.
+
+    Args:
+        selected: whether the file states that boxes are selected inside; None: it does not say.
+    """
     shape = outputs[0].shape if outputs else ()
+    gives = f"gives {_listed(outputs)}"
     if len(shape) != 3 or shape[0] not in (1, None):
-        raise ValueError(f"gives {_listed(outputs)}, which is no known layout for {classes} classes")
+        raise ValueError(f"{gives}, which is no known layout for {classes} classes")
     rows, columns = shape[1], shape[2]
+    head, more = str(stated.get("head", "")), _further_channels(task, stated, outputs)
+    found_for = f"for {classes} classes ({task})"
 
     def fits(length: int | None, least: int) -> bool:
-        return length is not None and (length == least if task == "detect" else length >= least)
+        return length is not None and (length >= least if more is None else length == least + more)
 
-    if "RTDETR" in str(stated.get("head", "")) and fits(columns, 4 + classes):
-        return "queries"
-    if selected and fits(columns, 6):
-        return "selected"
+    if "RTDETR" in head:
+        if columns is None or fits(columns, 4 + classes):
+            return "queries"
+        raise ValueError(f"states the head {head:.40} {found_for}, and {gives}")
+    if selected:
+        if columns is None or fits(columns, 6):
+            return "selected"
+        raise ValueError(f"states selected boxes (end2end or nms) {found_for}, and {gives}")
     if rows is None and columns is None:
         return "cells"  # `decoding` checks the length.
-    # The cells are at least as many as the channels.
-    if fits(rows, 4 + classes) and (columns is None or columns >= (rows or 0)):
+    as_cells, as_rows = fits(rows, 4 + classes), fits(columns, 4 + classes)
+    if as_cells and (more is not None or columns is None or columns >= (rows or 0)):
         return "cells"
-    if columns == 6 == 4 + classes and task == "detect" and "head" not in stated:
-        raise ValueError(
-            f"gives {_listed(outputs)}, selected boxes or queries of {classes} classes: its head is "
-            "not stated; export it with a later release"
-        )
-    # The repository YOLOv5 states no task: with one class it has 6 columns too.
-    if columns == 6 and task == "detect" and "task" in stated:
-        return "selected"
-    if task == "detect" and columns == 5 + classes:
+    known_head = any(part in head for part in _HEADS)
+    if as_rows and (is_cells(rows) or (known_head and selected is False and rows is None)):
+        return "rows"
+    if task == "detect" and "task" not in stated and columns == 5 + classes:
         return "objectness"
-    if task == "detect" and columns == 4 + classes:
+    if columns == 6 and task == "detect":
+        if as_rows and not known_head:
+            raise ValueError(
+                f"{gives}, selected boxes or queries of {classes} classes: its head is "
+                "not stated; export it with a later release"
+            )
+        if selected is False and "v10" not in head:
+            raise ValueError(f"states that no boxes are selected (end2end, nms: False), and {gives}")
+        if "task" in stated:
+            return "selected"
+    # RT-DETR of releases that state no head; its number of queries is fixed.
+    if as_rows and task == "detect" and "task" in stated and not known_head and rows is not None:
         return "queries"
-    raise ValueError(f"gives {_listed(outputs)}, which is no known layout for {classes} classes ({task})")
+    stated_head = f" of the head {head:.40}" if head else ""
+    raise ValueError(f"{gives}, which is no known layout {found_for}{stated_head}")
+
+
+def _further_channels(task: str, stated: Mapping[str, Any], outputs: Sequence[Port]) -> int | None:
+    """The channels after boxes and classes; None: not known from the file."""
+    if task == "segment":  # the coefficients of the masks, as many as prototypes
+        return outputs[1].shape[1] if len(outputs) == 2 and len(outputs[1].shape) == 4 else None
+    if task == "pose":
+        shape = _literal(stated.get("kpt_shape"))
+        if isinstance(shape, list | tuple) and len(shape) == 2 and all(type(n) is int for n in shape):
+            return int(shape[0] * shape[1])
+        return None
+    return {"detect": 0, "obb": 1}[task]
 
 
 def _by_shapes(
