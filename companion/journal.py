@@ -12,6 +12,8 @@ import re
 import sys
 from contextlib import suppress
 
+from vision.redaction import redacted
+
 # syslog(3): LOG_ERR, LOG_WARNING, LOG_INFO, LOG_DEBUG; the first whose level is reached.
 _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6), (logging.NOTSET, 7))
 _MARKED = re.compile(r"<[0-7]>")
@@ -40,7 +42,14 @@ def marked_for_journal(text: str, level: int) -> str:
     return marked(text, level) if is_journal(2) else text
 
 
-class _MarkingFormatter(logging.Formatter):
+class _Formatter(logging.Formatter):
+    """Without secrets, also in tracebacks."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return redacted(super().format(record))
+
+
+class _MarkingFormatter(_Formatter):
     def format(self, record: logging.LogRecord) -> str:
         return marked(super().format(record), record.levelno)
 
@@ -48,5 +57,11 @@ class _MarkingFormatter(logging.Formatter):
 def log_to_standard_error(level: int | str, line: str) -> None:
     """Let `logging` write to standard error. `line`: format of a line; the journal has its own times."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter((_MarkingFormatter if is_journal(2) else logging.Formatter)(line))
+    handler.setFormatter((_MarkingFormatter if is_journal(2) else _Formatter)(line))
     logging.basicConfig(level=level, handlers=[handler])
+
+
+def redact_last_resort() -> None:
+    """Let what is logged where no log was set up show no secrets either."""
+    if logging.lastResort is not None:
+        logging.lastResort.setFormatter(_Formatter())

@@ -8,10 +8,14 @@ from typing import Any
 import zenoh
 
 from companion.settings import ZenohSection
+from vision.redaction import redacted
 
 
 class BusError(ConnectionError):
     """The zenoh session cannot be opened (a busy port, a bad endpoint, a bad configuration file)."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(redacted(text))
 
 
 class EndpointTakenError(BusError):

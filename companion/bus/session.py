@@ -40,6 +40,7 @@ from companion.peer_data import Payload, copy_payload
 from companion.scheduling import set_scheduler_slice
 from companion.settings import ZenohSection
 from companion.tasks import spawn
+from vision.redaction import redacted
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
 
@@ -63,11 +64,13 @@ _LOG_PERIOD_S = 1.0
 
 
 def encode(body: Any) -> bytes:
-    """Encode a body as JSON, which lacks NaN and infinity: they become null.
+    """Encode a body as JSON, without secrets. JSON lacks NaN and infinity: they become null.
 
     A message with ten detections takes 28 µs, with `json.dumps` 114.
     """
-    return to_json(body, inf_nan_mode="null")
+    data = to_json(body, inf_nan_mode="null")
+    # Where no address is, there is no secret of one.
+    return redacted(data.decode()).encode() if b"://" in data or b"@" in data else data
 
 
 class Bus:
@@ -462,7 +465,7 @@ def _payload(query: zenoh.Query) -> Payload:
 
 def _reply(query: zenoh.Query, reply: dict[str, Any]) -> None:
     with query:
-        query.reply(query.key_expr, json.dumps(reply), encoding=zenoh.Encoding.APPLICATION_JSON)
+        query.reply(query.key_expr, redacted(json.dumps(reply)), encoding=zenoh.Encoding.APPLICATION_JSON)
 
 
 def _reply_body(query: zenoh.Query, key: str, body: Any) -> None:
@@ -474,4 +477,4 @@ def _reply_body(query: zenoh.Query, key: str, body: Any) -> None:
 
 def _reply_error(query: zenoh.Query, reason: str) -> None:
     with query:
-        query.reply_err(json.dumps({"reason": reason}), encoding=zenoh.Encoding.APPLICATION_JSON)
+        query.reply_err(redacted(json.dumps({"reason": reason})), encoding=zenoh.Encoding.APPLICATION_JSON)

@@ -25,7 +25,7 @@ from companion.cli.dashboard import dashboard
 from companion.cli.demo import demo
 from companion.cli.detect import detect
 from companion.cli.evaluate import evaluate
-from companion.cli.flags import CompanionCommands, plain_errors, settings_command
+from companion.cli.flags import EXIT_FAILED, CompanionCommands, plain_errors, settings_command
 from companion.cli.markers import markers
 from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.mission import mission
@@ -37,7 +37,8 @@ from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
 from companion.cli.view import view
-from companion.journal import is_journal, marked_for_journal
+from companion.journal import is_journal, marked_for_journal, redact_last_resort
+from vision.redaction import HIDDEN, print_traceback, redacted
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -148,7 +149,11 @@ def config(
             for line in check_settings(settings):
                 typer.echo(marked_for_journal(f"companion: {line}", logging.WARNING), err=True)
         return
-    typer.echo(to_toml(settings), nl=False)
+    text = to_toml(settings)
+    shown = redacted(text)
+    if shown != text:
+        typer.echo(f"companion: secrets in addresses are printed as {HIDDEN}", err=True)
+    typer.echo(shown, nl=False)
 
 
 @settings_command(app, "plugins")
@@ -177,6 +182,7 @@ app.registered_commands.sort(key=_help_position)
 
 def main() -> None:
     """Run the console script."""
+    redact_last_resort()
     if is_journal(2):
         from companion.operator.line_output import use_for_standard_error
 
@@ -184,4 +190,8 @@ def main() -> None:
     # End quietly when the reader of a pipe has gone (`| head`).
     if sys.argv[1:2] in (["detect"], ["echo"], ["preview"], ["depth"]):
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    app()
+    try:
+        app()
+    except Exception:  # a bug: its traceback may have an address
+        print_traceback()
+        sys.exit(EXIT_FAILED)

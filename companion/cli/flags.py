@@ -21,6 +21,7 @@ import typer.main
 from companion.journal import marked_for_journal
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
+from vision.redaction import redacted
 
 if TYPE_CHECKING:
     from companion.settings.reading import Flag
@@ -77,6 +78,7 @@ class CompanionCommands(typer.core.TyperGroup):
         except _UsageError as error:
             if text := _renamed_flag(getattr(error, "option_name", "")):
                 raise _UsageError(text, error.ctx) from error
+            error.message = redacted(error.message)
             raise
 
 
@@ -117,7 +119,7 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         yield
     except expected as error:
         for line in str(error).splitlines():
-            typer.echo(f"companion: {line}", err=True)
+            typer.echo(redacted(f"companion: {line}"), err=True)
         raise typer.Exit(code) from error
 
 

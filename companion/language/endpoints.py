@@ -15,6 +15,7 @@ from companion.language.tools import MAX_CALLS, ToolCall
 from companion.settings import LanguageSection
 from vision.extras import install_command
 from vision.file_kinds import kind_of_bytes
+from vision.redaction import redacted
 from vision.text_file import decode_text
 
 if TYPE_CHECKING:
@@ -28,7 +29,10 @@ OLLAMA_CONTEXT_TOKENS = 8192
 
 
 class LanguageError(RuntimeError):
-    """The model cannot be reached or its answer cannot be read. The message is one line."""
+    """The model cannot be reached or its answer cannot be read. The message is one line without secrets."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(redacted(text))
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,7 @@ import logging
 import pickle
 import socket
 import struct
+import sys
 import threading
 import traceback
 from collections import deque
@@ -24,6 +25,7 @@ from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
 from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
+from vision.redaction import redacted
 from vision.tracking import Selected, SelectRequest, TrackEventKind
 
 _LENGTH = struct.Struct(">I")
@@ -414,9 +416,10 @@ class ResultLogHandler(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         try:
-            text = " ".join(record.getMessage().split())[:_LONGEST_LINE]
+            text = redacted(" ".join(record.getMessage().split()))[:_LONGEST_LINE]
             self._sender.put(LogLine(record.levelno, record.name, text))
             if record.exc_info:
-                traceback.print_exception(record.exc_info[1])
+                lines = traceback.format_exception(record.exc_info[1])
+                print(redacted("".join(lines)), end="", file=sys.stderr, flush=True)
         except Exception:  # a bad log call must not end perception; logging prints it to standard error
             self.handleError(record)

@@ -16,7 +16,6 @@ import socket
 import sys
 import threading
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -56,6 +55,7 @@ from vision.object_detector import YOLO, DetectionsError, ObjectDetector
 from vision.path_planner import PathRequest
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.recording import Recording
+from vision.redaction import print_traceback, redacted
 from vision.runtimes.exported import kind_of
 from vision.sources import EndOfStream, Source, SourceError, SourceUnavailableError, check_there, open_source
 from vision.sources.shared import FrameSharing
@@ -244,7 +244,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             wrong = isinstance(error, FileNotFoundError | PermissionError | IsADirectoryError)
             return StartFailed(_one_line(error), wrong_settings=wrong)
         except Exception as error:  # a bug: the traceback goes to standard error
-            traceback.print_exc()
+            print_traceback()
             text = f"perception cannot start: {type(error).__name__}: {_one_line(error)}"
             return StartFailed(text, wrong_settings=False)
         # Loaded objects stay: scanning them would cost the garbage collector the time of a frame.
@@ -269,7 +269,7 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
         except (SourceError, DetectionsError) as error:
             return Ended(False, _one_line(error), pipeline.frames)
         except Exception as error:
-            traceback.print_exc()
+            print_traceback()
             return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
         frames = pipeline.frames
     return Ended(True, "stop requested", frames)
@@ -399,7 +399,7 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
 
 
 def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
+    return redacted(" ".join(str(error).split()))
 
 
 if __name__ == "__main__":

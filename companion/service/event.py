@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.bodies.service import EventBody
+from vision.redaction import redacted
 
 logger = logging.getLogger(__package__)
 
@@ -39,7 +40,8 @@ class EventLog:
         self.newest: deque[Event] = deque(maxlen=100)
 
     def add(self, level: str, text: str) -> None:
-        """Add an event. Never raises, whatever the listener does."""
+        """Add an event, without secrets. Never raises, whatever the listener does."""
+        text = redacted(text)
         event = Event(time.monotonic_ns(), level, text)
         self.newest.append(event)
         logger.log(getattr(logging, level.upper()), "%s", text)

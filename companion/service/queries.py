@@ -16,6 +16,7 @@ from companion.perception.cameras import WorkerCamera
 from companion.perception.supervisor import PerceptionState
 from companion.settings import Settings
 from vision.model_files import kept_models
+from vision.redaction import without_password
 
 IMAGE_TIMEOUT_S = 3.0
 # User and password in an address, and what follows its path: an access token, a network interface.
@@ -113,6 +114,7 @@ def without_secrets(value: Any) -> Any:
         }
     if isinstance(value, list):
         return [without_secrets(item) for item in value]
-    if isinstance(value, str) and "://" in value:
-        return _PARAMETERS.sub("***", _CREDENTIALS.sub("***@", value))
+    if isinstance(value, str):
+        value = without_password(value)
+        return _PARAMETERS.sub("***", _CREDENTIALS.sub("***@", value)) if "://" in value else value
     return value

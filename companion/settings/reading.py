@@ -33,6 +33,7 @@ from companion.settings.section import Section
 from companion.settings.settings import Settings
 from companion.toml_text import parse_toml
 from vision.file_kinds import explained
+from vision.redaction import redacted
 from vision.text_file import read_text
 
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
@@ -58,6 +59,7 @@ class ConfigurationError(ValueError):
     """Invalid settings. `problems` has one line each; the message is those lines."""
 
     def __init__(self, *problems: str) -> None:
+        problems = tuple(map(redacted, problems))
         super().__init__("\n".join(problems))
         self.problems = problems
 

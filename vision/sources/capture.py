@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 from vision.orientation import Orientation
+from vision.redaction import redacted, without_password
 from vision.sources.depth_images import to_metres
 from vision.sources.source import EndOfStream, SourceError, SourceSettings
 
@@ -24,6 +25,9 @@ _LONGEST_LAG_S = 1.0  # of stamps behind the media time that may catch up with i
 
 class CaptureError(Exception):
     """The capture stopped or could not be opened; another attempt may succeed."""
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(redacted(text))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,5 +252,6 @@ def adapted(open_capture: OpenCapture, settings: SourceSettings) -> OpenCapture:
 
 
 def label(uri: str, settings: SourceSettings) -> str:
-    """A source in messages: its address, after its name if it has one."""
-    return uri if settings.name is None else f"{settings.name} ({uri})"
+    """A source in messages: its address without secrets, after its name if it has one."""
+    shown = without_password(uri)
+    return shown if settings.name is None else f"{settings.name} ({shown})"

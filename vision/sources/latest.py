@@ -86,7 +86,7 @@ class LatestSource(Source):
         self._pace_origin_s: float | None = None
         self._advice = advice
         self._open_deadline_s = time.monotonic() + settings.open_timeout_s
-        self._thread = threading.Thread(target=self._run, name=f"source {uri}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"source {self.uri}", daemon=True)
         self._thread.start()
         self._wait_for_first_frame()
 

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import ipaddress
 import os
+import re
 import socket
 import tempfile
 import time
@@ -18,6 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.redaction import HIDDEN, without_password
 from vision.sources.capture import Capture, CaptureError, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, read_capture
 from vision.sources.source import SourceError, SourceSettings, SourceUnavailableError
@@ -43,13 +45,39 @@ _HTTP_ERRORS = {
 }
 
 
-def without_password(uri: str) -> str:
-    """The address for display: the password replaced by stars."""
-    parts = urlsplit(uri)
-    if parts.password is None:
-        return uri
-    host = parts.netloc.rpartition("@")[2]
-    return urlunsplit(parts._replace(netloc=f"{parts.username}:***@{host}"))
+_ENCODED = {"#": "%23", "/": "%2F", "?": "%3F"}
+
+
+def check_user_info(uri: str) -> None:
+    """Check that user, password and port of a network address are read as they are meant.
+
+    Raises:
+        SourceError: a `#`, `/` or `?` in the password ends it there, the password is stars, or the port is
+            no number.
+    """
+    rest = uri.partition("://")[2]
+    authority = re.split("[/?#]", rest, maxsplit=1)[0]
+    port, after = authority.rpartition(":")[2], rest[len(authority) :]
+    cut = "@" in after and "@" not in authority and ":" in authority
+    if cut and (not port.isdecimal() or after.startswith("#")):
+        found = [each for each in _ENCODED if each in rest.rpartition("@")[0]]
+        remedy = ", ".join(f"{each} as {_ENCODED[each]}" for each in found)
+        raise SourceError(
+            f"{without_password(uri)}: the user or password has a character that ends it: "
+            f"percent-encode {remedy}"
+        )
+    try:
+        parts = urlsplit(uri)
+        valid = parts.port != 0
+        stars = parts.password == HIDDEN
+    except ValueError:  # its text may have the password
+        valid = stars = False
+    if stars:
+        raise SourceError(f"{uri}: the password was removed from this address: write it there")
+    if not valid:
+        raise SourceError(
+            f"{without_password(uri)}: expected SCHEME://USER:PASSWORD@HOST:PORT with a port from 1 to 65535"
+        )
 
 
 class StreamCapture(Capture):

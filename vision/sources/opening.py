@@ -14,6 +14,7 @@ from pathlib import Path
 
 from vision.calibration.camera_info import read_registration
 from vision.home import expanded
+from vision.redaction import without_password
 from vision.registry import shown
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
@@ -22,7 +23,7 @@ from vision.sources.depth_cameras import OakCapture, RealsenseCapture, load_modu
 from vision.sources.depth_images import DEPTH_SUFFIXES, decode_depth, is_depth_image
 from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image, partners
 from vision.sources.latest import LatestSource
-from vision.sources.network import UdpStream, open_http, open_rtsp, without_password
+from vision.sources.network import UdpStream, check_user_info, open_http, open_rtsp
 from vision.sources.opencv import quiet_opencv
 from vision.sources.paired import TOLERANCE_S, DepthImages, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
@@ -42,6 +43,7 @@ _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 _WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "realsense", "oak")
 # Suffixes of names that may be a device's, a FIFO's or a mount's, which come by themselves.
 _OF_PIPES = ("", ".fifo", ".pipe")
+_NETWORK = ("rtsp", "rtsps", "http", "https")
 _WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
 
@@ -105,7 +107,10 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     if not scheme:
         return _open_path(expanded(uri), settings)
-    opened = _opener(scheme, name)(uri, settings)
+    opener = _opener(scheme, name)
+    if scheme in _NETWORK:
+        check_user_info(uri)
+    opened = opener(uri, settings)
     if not isinstance(opened, Source):
         with contextlib.suppress(Exception):  # a plug-in's own class, or nothing to close
             opened.close()
@@ -132,6 +137,8 @@ def check_address(uri: str, settings: SourceSettings) -> None:
             raise SourceError(f"{path}: no permission to read it")
         return
     _opener(scheme, without_password(uri))
+    if scheme in _NETWORK:
+        check_user_info(uri)
     if scheme == "csi":
         parse_csi_number(uri), csi_settings(uri, settings)
         check_csi_program(uri)

@@ -10,6 +10,7 @@ from typing import Self
 from vision.camera_model import CameraCalibration
 from vision.frame import Frame
 from vision.orientation import Orientation
+from vision.redaction import redacted
 
 RAW_PIXEL_FORMATS = {"bgr24": 3.0, "rgb24": 3.0, "gray8": 1.0, "yuv420": 1.5, "gray16": 2.0}
 """Raw pixel formats of a pipe → bytes per pixel."""
@@ -18,7 +19,13 @@ PIPE_PIXEL_FORMATS = (*RAW_PIXEL_FORMATS, "y4m", "mjpeg")
 
 
 class SourceError(Exception):
-    """A source cannot be opened, or cannot continue. The text is one line that says what to do."""
+    """A source cannot be opened, or cannot continue. The text is one line that says what to do.
+
+    Passwords in it are replaced by stars.
+    """
+
+    def __init__(self, text: str = "") -> None:
+        super().__init__(redacted(text))
 
 
 class SourceUnavailableError(SourceError):
