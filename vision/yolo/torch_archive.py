@@ -141,7 +141,9 @@ def read_archive(path: str | Path) -> Any:
     try:
         return _read(path)
     except CheckpointError as error:
-        raise type(error)(one_line(explained(path, f"{path}: {error}", "is a checkpoint of torch"))) from None
+        # A checkpoint is a zip archive: of these the error says more.
+        line = explained(path, f"{path}: {error}", "is a checkpoint of torch", "is a zip archive")
+        raise type(error)(one_line(line)) from None
     except FileNotFoundError:
         raise CheckpointError(f"{path}: no such file; {missing_model_advice(path)}") from None
     except IsADirectoryError:

@@ -322,7 +322,7 @@ def test_file_that_is_no_policy_is_refused_in_one_line(write: Write, tmp_path: P
     with pytest.raises(GrammarError, match=r"tried.onnx: .*usable ONNX .*: [^\n]+$"):
         built(path)
     path.write_bytes(b"")
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*usable ONNX .*: [^\n]+$"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: is empty"):
         built(path)
     path.write_bytes(bytes(4_000_001))
     with pytest.raises(GrammarError, match=r"4000000 bytes, .* 4000001"):
