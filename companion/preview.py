@@ -140,7 +140,13 @@ def preview_image(
     if grey:
         size = (max(frame.width // GREY_DIVISOR, 1), max(frame.height // GREY_DIVISOR, 1))
         small = cv2.resize(cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY), size, interpolation=cv2.INTER_AREA)
-        frame = replace(frame, image=cv2.cvtColor(small, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False))
+        image = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR).astype(np.uint8, copy=False)
+        depth_m = frame.depth_m
+        if depth_m is not None:
+            depth_m = cv2.resize(depth_m, size, interpolation=cv2.INTER_NEAREST).astype(
+                np.float32, copy=False
+            )
+        frame = replace(frame, image=image, depth_m=depth_m)
     return annotate_level(frame, Detections.empty(()), level, lines=lines)
 
 

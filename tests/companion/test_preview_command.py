@@ -13,7 +13,7 @@ from companion.preview import PreviewOptions, RateMeter, preview_source
 from mavlink_sim.testing import free_udp_ports, vehicle
 from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion, companion_here
-from vision.sources import open_source
+from vision.sources import SourceSettings, open_source
 
 pytestmark = pytest.mark.realtime
 
@@ -73,6 +73,20 @@ def test_every_frame_is_saved_with_its_lines(
     below = image[-1, -1].astype(int)
     assert np.ptp(below) < 8 if grey else abs(below - (200, 40, 40)).max() < 8
     assert image[: shape[0] // 3, : shape[1] // 3].std() > 20
+
+
+def test_a_grey_image_with_depth_is_saved(tmp_path: Path) -> None:
+    (tmp_path / "colour").mkdir()
+    (tmp_path / "depth").mkdir()
+    assert cv2.imwrite(str(tmp_path / "colour" / "0.png"), np.full((240, 480, 3), 90, np.uint8))
+    assert cv2.imwrite(str(tmp_path / "depth" / "0.png"), np.full((240, 480), 4000, np.uint16))
+    settings = SourceSettings(depth=str(tmp_path / "depth"))
+    with open_source(str(tmp_path / "colour"), settings) as source:
+        options = PreviewOptions("v/image", tmp_path / "out", True, period_s=0.0)
+        assert preview_source(source, options, lambda _: None) == 1
+    image = cv2.imread(str(tmp_path / "out" / "000000.jpg"))
+    assert image is not None
+    assert image.shape == (80, 160, 3)
 
 
 def test_preview_of_a_rotated_source(image_folder: Path, tmp_path: Path) -> None:

@@ -351,8 +351,10 @@ def test_summary_of_a_depth_image() -> None:
 def test_every_whole_millimetre_is_exact() -> None:
     millimetres = np.arange(2**16, dtype=np.uint16).reshape(256, 256)
     depth_m = to_metres(millimetres, None)
-    np.testing.assert_array_equal(depth_millimetres(depth_m), millimetres)
     assert math.isnan(depth_m[0, 0])
+    assert math.isnan(depth_m[-1, -1])  # 65535: no measurement
+    millimetres[-1, -1] = 0
+    np.testing.assert_array_equal(depth_millimetres(depth_m), millimetres)
 
 
 def test_other_depth_is_rounded_and_unknown_stays_unknown() -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import struct
 import time
+import zlib
 from pathlib import Path
 
 import cv2
@@ -136,6 +138,24 @@ def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) 
         frames = list(source)
     assert [int(frame.image[0, 0, 0]) for frame in frames] == [20, 40, 200]
     assert [frame.width for frame in frames] == [17, 18, 26]
+
+
+def test_image_that_cannot_be_shown_names_why(tmp_path: Path) -> None:
+    floats = tmp_path / "float.tiff"
+    assert cv2.imwrite(str(floats), np.ones((8, 8), np.float32))
+    header = struct.pack(">IIBBBBB", 34000, 32000, 8, 0, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b""))
+    huge = tmp_path / "huge.png"
+    huge.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+    )
+    for path, why in ((floats, "32-bit floats"), (huge, "34000x32000 pixels")):
+        with pytest.raises(SourceError, match=rf"{path.name}: {why}"), open_source(str(path)) as source:
+            source.read()
 
 
 def test_unreadable_image_is_logged_counted_and_skipped(

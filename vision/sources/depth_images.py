@@ -88,7 +88,7 @@ def _decode_exr(path: Path, data: bytes) -> NDArray[Any] | None:
 
 
 def to_metres(image: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]:
-    """(height, width) float32 metres, NaN for holes: 0, negative, NaN and infinity.
+    """(height, width) float32 metres, NaN for holes: 0, 65535 of integers, negative, NaN and infinity.
 
     Args:
         image: (height, width), uint16 or float.
@@ -102,6 +102,8 @@ def to_metres(image: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]
     with np.errstate(over="ignore", invalid="ignore"):
         depth_m = image.astype(np.float32) * np.float32(scale)
         known = (depth_m > 0.0) & (depth_m < np.inf)
+    if integer:  # a sensor's "no measurement"
+        known &= image != np.iinfo(image.dtype).max
     depth_m[~known] = np.nan
     if not integer and known.any():
         median_m = float(np.median(depth_m[known]))

@@ -55,6 +55,10 @@ def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[P
     return paths
 
 
+# Of these the decoder knows more than the kind of file.
+_IMAGES = tuple(f"is a {kind} image" for kind in ("JPEG", "PNG", "GIF", "TIFF", "WebP"))
+
+
 def decode_image(data: bytes) -> NDArray[np.uint8] | None:
     """(height, width, 3) BGR of an encoded image, rotated by its EXIF orientation; None if unreadable."""
     if not data:
@@ -64,6 +68,22 @@ def decode_image(data: bytes) -> NDArray[np.uint8] | None:
     except cv2.error:  # a size beyond OpenCV's limits
         return None
     return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
+
+
+def unreadable_reason(data: bytes) -> str:
+    """Why `decode_image` cannot read these bytes."""
+    try:
+        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
+    except cv2.error as error:
+        if "CV_IO_MAX_IMAGE" not in str(error):
+            return f"cannot be decoded: {error.err}"
+        size = ""
+        if data.startswith(b"\x89PNG"):
+            size = f"{int.from_bytes(data[16:20], 'big')}x{int.from_bytes(data[20:24], 'big')} pixels, "
+        return f"{size}more than OpenCV's limit of 2^30 pixels, 2^20 a side; cut it into tiles"
+    if raw is not None and raw.dtype.kind == "f":
+        return f"{raw.itemsize * 8}-bit floats are not an image of colours; convert it to 8 bits"
+    return "not an image that can be read; it may be truncated or damaged"
 
 
 def _decode_colour(_path: Path, data: bytes) -> NDArray[np.uint8] | None:
@@ -124,8 +144,9 @@ class ImagesCapture(Capture):
             self._next += 1
             started_ns = time.monotonic_ns()
             try:
-                image = self._decode(path, path.read_bytes())
-                reason = "not an image that can be read; it may be truncated or damaged"
+                data = path.read_bytes()
+                image = self._decode(path, data)
+                reason = "" if image is not None else unreadable_reason(data)
             except OSError as error:
                 image, reason = None, error.strerror or str(error)
             if image is not None:
@@ -134,7 +155,7 @@ class ImagesCapture(Capture):
                 return RawFrame(image, media_s=media_s, decode_ms=decode_ms, file_name=path.name)
             self.unreadable += 1
             if self.total_frames == 1:
-                raise SourceError(explained(path, f"{path}: {reason}"))
+                raise SourceError(explained(path, f"{path}: {reason}", *_IMAGES))
             logger.warning("%s: skipped: %s", path, reason)
         if self.unreadable == len(self._paths):
             raise SourceError(f"{self._paths[0][1]}: none of the {len(self._paths)} images could be read")
