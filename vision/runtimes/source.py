@@ -38,7 +38,7 @@ _RUNNERS: dict[ExportKind, tuple[RuntimeName, ...]] = {
 }
 
 # A TorchScript file is an archive of torch too.
-_FITTING = ("is a checkpoint of torch",)
+_FITTING = ("is a checkpoint of torch", "is a zip archive")
 
 
 @dataclass(slots=True)
