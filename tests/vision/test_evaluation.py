@@ -153,9 +153,73 @@ def test_a_coco_file_is_read_with_its_crowds(tmp_path: Path) -> None:
         assert (dataset.kind, dataset.class_names) == ("COCO", ("car", "dog"))
         (sample,) = dataset.samples
         assert sample.image == tmp_path / "val2017" / "a.jpg"
-        assert sample.boxes_in(1, 1).tolist() == [[10, 20, 40, 60], [0, 0, 5.5, 5]]
+        assert sample.boxes_in(200, 100).tolist() == [[10, 20, 40, 60], [0, 0, 5.5, 5]]
         assert sample.class_ids.tolist() == [1, 0]
         assert sample.ignored.tolist() == [False, True]
+
+
+@pytest.mark.parametrize("size", [(100, 200), (100, 50)])
+def test_coco_boxes_of_another_size_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    width, height = size
+    listed = {"id": 7, "file_name": "a.jpg", "width": width, "height": height}
+    (sample,) = open_dataset(coco(tmp_path, images=[listed])).samples
+    image = read_image(sample.image)
+    with pytest.raises(DatasetError, match=rf"a\.jpg: .* {width}x{height} .* 200x100 "):
+        sample.boxes_in(image.shape[1], image.shape[0])
+
+
+def test_coco_image_ids_may_be_text_beside_numbers(tmp_path: Path) -> None:
+    boxes = [{"image_id": "7", "category_id": 3, "bbox": [0, 0, 5, 5]}]
+    (sample,) = open_dataset(coco(tmp_path, annotations=boxes)).samples
+    assert sample.class_ids.tolist() == [0]
+
+
+@pytest.mark.parametrize("keypoint", ["0.5 0.5 2", "0.5 0.5"])
+def test_box_of_a_label_with_keypoints(yolo: Path, keypoint: str) -> None:
+    each = len(keypoint.split())
+    names = f"val: images/val\nnames: [one, two]\nkpt_shape: [3, {each}]\n"
+    table = text(yolo / "data.yaml", names)
+    points = " ".join([keypoint] * 3)
+    text(yolo / "labels" / "val" / "a.txt", f"1 0.25 0.25 0.5 0.5 {points}\n")
+    text(yolo / "labels" / "val" / "b.txt", "0 0.5 0.5 0.2 0.4\n")  # without keypoints
+    dataset = open_dataset(table)
+    assert (pixels(dataset, 0), pixels(dataset, 1)) == ([[0, 0, 100, 50]], [[80, 30, 120, 70]])
+    text(yolo / "labels" / "val" / "a.txt", f"1 0.25 0.25 0.5 0.5 {points} 0.5\n")
+    with pytest.raises(DatasetError, match=rf"a\.txt, line 1: `kpt_shape: \[3, {each}\]` .* {5 + 3 * each} "):
+        open_dataset(table)
+
+
+def test_a_wrong_kpt_shape_is_named(yolo: Path) -> None:
+    for shape in ("17", "[17]", "[17, 4]", "[0, 3]", "[a, 2]"):
+        table = text(yolo / "data.yaml", f"val: images/val\nkpt_shape: {shape}\n")
+        with pytest.raises(DatasetError, match=r"data\.yaml: `kpt_shape`"):
+            open_dataset(table)
+
+
+def test_repeated_labels_are_used_once(yolo: Path, caplog: pytest.LogCaptureFixture) -> None:
+    text(yolo / "labels" / "val" / "a.txt", "0 0.5 0.5 0.2 0.4\n1 0.25 0.25 0.5 0.5\n0 0.5 0.5 0.2 0.4\n")
+    dataset = open_dataset(yolo)
+    assert dataset.samples[0].class_ids.tolist() == [0, 1]
+    assert pixels(dataset, 0) == [[80, 30, 120, 70], [0, 0, 100, 50]]
+    box = {"image_id": 7, "category_id": 3, "bbox": [0, 0, 5, 5]}
+    (sample,) = open_dataset(coco(yolo, annotations=[box, box])).samples
+    assert sample.class_ids.tolist() == [0]
+    assert [record.args[1] for record in caplog.records if isinstance(record.args, tuple)] == [1, 1]
+
+
+@pytest.mark.parametrize("entry", ["../valid/images", "..\\valid\\images", "valid\\images"])
+def test_roboflow_and_windows_paths_are_found(tmp_path: Path, entry: str) -> None:
+    make_image(tmp_path / "set" / "valid" / "images" / "a.jpg")
+    text(tmp_path / "set" / "valid" / "labels" / "a.txt", "0 0.5 0.5 0.2 0.4\n")
+    table = text(tmp_path / "set" / "data.yaml", f"val: {entry}\nnames: [car]\n")
+    dataset = open_dataset(table)
+    assert pixels(dataset, 0) == [[80, 30, 120, 70]]
+
+
+def test_apple_double_files_are_left_out(yolo: Path) -> None:
+    for path in (yolo / "images" / "val" / "._a.jpg", yolo / "labels" / "val" / "._a.txt"):
+        path.write_bytes(b"\x00\x05\x16\x07\x00\x02\x00\x00Mac OS X")
+    assert [sample.image.name for sample in open_dataset(yolo).samples] == ["a.jpg", "b.jpg", "c.jpg"]
 
 
 def annotated(**changes: Any) -> dict[str, Any]:

@@ -10,13 +10,14 @@ COCO: one JSON file of images, categories and annotations (cocodataset.org, Data
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +26,10 @@ from numpy.typing import NDArray
 from vision.file_kinds import explained
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
+
+logger = logging.getLogger(__name__)
+
+_Label = TypeVar("_Label", bound=Hashable)
 
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 _TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
@@ -82,6 +87,7 @@ class Sample:
         boxes: (N, 4) float32 xyxy: pixels, or fractions of the image if `in_fractions`.
         class_ids: (N,) int64.
         in_fractions: as in YOLO labels.
+        stated_size: width and height of the image by the data set, pixels; None: not stated.
         ignored: (N,) bool: regions that need not be detected (COCO's `iscrowd`).
     """
 
@@ -90,13 +96,27 @@ class Sample:
     class_ids: NDArray[np.int64]
     in_fractions: bool = False
     ignored: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+    stated_size: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.ignored.shape != self.class_ids.shape:
             object.__setattr__(self, "ignored", np.zeros(len(self.class_ids), np.bool_))
 
     def boxes_in(self, width: int, height: int) -> NDArray[np.float32]:
-        """(N, 4) float32 xyxy in the pixels of an image of this size."""
+        """(N, 4) float32 xyxy in the pixels of an image of this size.
+
+        Raises:
+            DatasetError: the data set states another size, so its boxes are of another image.
+        """
+        if self.stated_size is not None and self.stated_size != (width, height):
+            stated_width, stated_height = self.stated_size
+            turned = self.stated_size == (height, width)
+            why = "its EXIF orientation turns it" if turned else "it was resized"
+            raise DatasetError(
+                f"{self.image}: the annotations state {stated_width}x{stated_height} pixels, the image has "
+                f"{width}x{height} ({why}): their boxes do not fit it; annotate this image, or use "
+                f"the original"
+            )
         if not self.in_fractions:
             return self.boxes
         return self.boxes * np.array([width, height, width, height], np.float32)
@@ -132,7 +152,9 @@ def image_files(folder: Path) -> list[Path]:
 def _images_below(folder: Path) -> Iterator[Path]:
     for where, folders, names in os.walk(folder):
         folders.sort()
-        yield from (Path(where, name) for name in names if Path(name).suffix.lower() in IMAGE_SUFFIXES)
+        # macOS adds `._NAME` files, which are no images.
+        shown = (name for name in names if not name.startswith("._"))
+        yield from (Path(where, name) for name in shown if Path(name).suffix.lower() in IMAGE_SUFFIXES)
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
@@ -191,31 +213,61 @@ def read_coco(path: Path, images: Path | None = None) -> Dataset:
     names, ids = _categories(_entries(content, "categories", path), path)
     annotations = defaultdict(list)
     for index, entry in enumerate(_entries(content, "annotations", path)):
-        image_id, class_id, box, crowd = _annotation(entry, ids, f"{path}, annotation {index}")
-        annotations[image_id].append((class_id, box, crowd))
+        of_image, class_id, box, crowd = _annotation(entry, ids, f"{path}, annotation {index}")
+        annotations[str(of_image)].append((class_id, box, crowd))
     samples = []
+    repeated = 0
     finder = _ImageFinder(path, images)
     for index, entry in enumerate(_entries(content, "images", path)):
         where = f"{path}, image {index}"
         image_id, file_name = entry.get("id"), entry.get("file_name")
         if type(image_id) not in (int, str) or not isinstance(file_name, str):
             raise DatasetError(f"{where}: expected `id` and `file_name`")
-        seen = annotations.pop(image_id, [])
+        given = annotations.pop(str(image_id), [])
+        seen = _once(given)
+        repeated += len(given) - len(seen)
         samples.append(
             Sample(
                 finder.find(file_name, where),
                 np.array([box for _, box, _ in seen], np.float32).reshape(-1, 4),
                 np.array([class_id for class_id, _, _ in seen], np.int64),
                 ignored=np.array([crowd for _, _, crowd in seen], np.bool_),
+                stated_size=_stated_size(entry, where),
             )
         )
     if annotations:
         raise DatasetError(
-            f"{path}: has annotations of the image {next(iter(annotations))!r}, which is not listed"
+            f"{path}: has annotations of the image {next(iter(annotations)):.100}, which is not listed"
         )
     if not samples:
         raise DatasetError(f"{path}: lists no images")
+    _report_repeated(path, repeated)
     return Dataset(path, "COCO", names, tuple(samples))
+
+
+def _once(labels: Iterable[_Label]) -> list[_Label]:
+    """Without those that are given again."""
+    return list(dict.fromkeys(labels))
+
+
+def _report_repeated(path: Path, repeated: int) -> None:
+    if repeated:
+        logger.warning(
+            "%s: %d labels are given more than once in an image; each is used once", path, repeated
+        )
+
+
+def _stated_size(entry: dict[str, Any], where: str) -> tuple[int, int] | None:
+    size = entry.get("width"), entry.get("height")
+    if size == (None, None) or size == (0, 0):
+        return None
+    width, height = size
+    if type(width) is not int or type(height) is not int or min(width, height) <= 0:
+        raise DatasetError(
+            f"{where}: width and height must be whole numbers of pixels, got {width!r:.100} and "
+            f"{height!r:.100}"
+        )
+    return width, height
 
 
 def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, Any]]:
@@ -239,7 +291,9 @@ def _categories(entries: list[dict[str, Any]], path: Path) -> tuple[tuple[str, .
     return tuple(names), ids
 
 
-def _annotation(entry: dict[str, Any], ids: dict[Any, int], where: str) -> tuple[Any, int, list[float], bool]:
+def _annotation(
+    entry: dict[str, Any], ids: dict[Any, int], where: str
+) -> tuple[int | str, int, tuple[float, ...], bool]:
     category, box = entry.get("category_id"), entry.get("bbox")
     if type(category) is not int or category not in ids:
         raise DatasetError(f"{where}: its category_id {category!r:.100} is not in categories")
@@ -258,7 +312,7 @@ def _annotation(entry: dict[str, Any], ids: dict[Any, int], where: str) -> tuple
     return (
         entry["image_id"],
         ids[category],
-        [left, top, left + width, top + height],
+        (left, top, left + width, top + height),
         bool(entry.get("iscrowd")),
     )
 
@@ -293,22 +347,26 @@ def read_yolo(path: Path, split: str | None = None, class_names: tuple[str, ...]
     table_path = (
         path if path.is_file() else next((path / n for n in _TABLE_NAMES if (path / n).is_file()), None)
     )
+    keypoints = None
     if table_path is None:
         names, images = class_names, image_files(path / "images" if (path / "images").is_dir() else path)
     else:
         table = _read_table(table_path)
         names, images = _names(table, table_path) or class_names, _images_of(table, table_path, split)
+        keypoints = _keypoints(table, table_path)
     if not images:
         raise DatasetError(
             f"{path}: has no images; expected images/ and labels/, or images with label files beside them"
         )
-    samples = tuple(_sample(image, path, names) for image in images)
+    read = [_sample(image, path, names, keypoints) for image in images]
+    samples = tuple(sample for sample, _ in read)
     if not any(_labels_path(image, path).is_file() for image in images):
         raise DatasetError(
             f"{path}: none of its {len(images)} images has labels; for {images[0]} "
             f"{_labels_path(images[0], path)} was expected"
         )
     _check_labels_have_images(images, path)
+    _report_repeated(path, sum(repeated for _, repeated in read))
     return Dataset(path, "YOLO", names, samples)
 
 
@@ -319,6 +377,8 @@ def _check_labels_have_images(images: list[Path], root: Path) -> None:
             continue
         shown = {image.stem for image in folder.iterdir() if image.suffix.lower() in IMAGE_SUFFIXES}
         for path in sorted(labels.glob("*.txt")):
+            if path.name.startswith("._"):
+                continue
             if path.stem not in shown and path.name != "classes.txt":  # labelling programs list the names
                 raise DatasetError(
                     f"{path}: its image {folder / path.stem}.jpg (or of another kind) does not exist; "
@@ -349,6 +409,21 @@ def _names(table: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
     return tuple(str(name) for name in names)
 
 
+def _keypoints(table: dict[Any, Any], path: Path) -> tuple[int, int] | None:
+    """`kpt_shape`: the number of keypoints of each label, and the numbers of each (2 or 3); None: none."""
+    shape = table.get("kpt_shape")
+    if shape is None:
+        return None
+    if (
+        not isinstance(shape, list)
+        or len(shape) != 2
+        or not all(type(number) is int and number > 0 for number in shape)
+        or shape[1] not in (2, 3)
+    ):
+        raise DatasetError(f"{path}: `kpt_shape` must be [keypoints, 2 or 3], got {shape!r:.100}")
+    return shape[0], shape[1]
+
+
 def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Path]:
     available = [name for name in _SPLITS if table.get(name)]
     chosen = split or (available[0] if available else None)
@@ -363,7 +438,7 @@ def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Pat
     entries = table[chosen] if isinstance(table[chosen], list) else [table[chosen]]
     found: list[Path] = []
     for entry in entries:
-        where = base / str(entry)
+        where = _place(base, str(entry))
         if where.is_dir():
             found += image_files(where)
         elif where.is_file() and where.suffix == ".txt":
@@ -376,6 +451,13 @@ def _images_of(table: dict[Any, Any], path: Path, split: str | None) -> list[Pat
         else:
             raise DatasetError(f"{path}: `{chosen}` names {where}, which does not exist")
     return found
+
+
+def _place(base: Path, entry: str) -> Path:
+    """Where an entry of `data.yaml` is. Roboflow writes `../valid/images` beside the folder `valid`."""
+    slashed = entry.replace("\\", "/")
+    places = [base / entry, base / slashed, base / slashed.removeprefix("../")]
+    return next((place for place in places if place.exists()), places[0])
 
 
 def _listed(line: str, base: Path, source: Path, number: int) -> Path:
@@ -397,28 +479,33 @@ def _labels_path(image: Path, root: Path) -> Path:
     return image.with_suffix(".txt")
 
 
-def _sample(image: Path, root: Path, names: tuple[str, ...] | None) -> Sample:
+def _sample(
+    image: Path, root: Path, names: tuple[str, ...] | None, keypoints: tuple[int, int] | None
+) -> tuple[Sample, int]:
+    """An image with its labels, and how many of these were repeated."""
     path = _labels_path(image, root)
     if not path.is_file():
-        return Sample(image, np.zeros((0, 4), np.float32), np.zeros(0, np.int64), in_fractions=True)
+        return Sample(image, np.zeros((0, 4), np.float32), np.zeros(0, np.int64), in_fractions=True), 0
     if path.stat().st_size > _LARGEST_LABELS_BYTES:
         raise DatasetError(f"{path}: has {path.stat().st_size} bytes, too many for a label file")
     try:
         lines = read_text(path).splitlines()
     except UnicodeDecodeError as error:
         raise DatasetError(f"{path}: {error}") from None
-    boxes: list[NDArray[np.float64]] = []
-    class_ids: list[int] = []
+    given: list[tuple[int, tuple[float, ...]]] = []
     for number, line in enumerate(lines, 1):
         if words := line.split():
-            class_id, box = _label(words, f"{path}, line {number}", names)
-            class_ids.append(class_id)
-            boxes.append(box)
-    xyxy = np.array(boxes, np.float32).reshape(-1, 4)
-    return Sample(image, xyxy, np.array(class_ids, np.int64), in_fractions=True)
+            class_id, box = _label(words, f"{path}, line {number}", names, keypoints)
+            given.append((class_id, tuple(box.tolist())))
+    labels = _once(given)
+    xyxy = np.array([box for _, box in labels], np.float32).reshape(-1, 4)
+    class_ids = np.array([class_id for class_id, _ in labels], np.int64)
+    return Sample(image, xyxy, class_ids, in_fractions=True), len(given) - len(labels)
 
 
-def _label(words: list[str], where: str, names: tuple[str, ...] | None) -> tuple[int, NDArray[np.float64]]:
+def _label(
+    words: list[str], where: str, names: tuple[str, ...] | None, keypoints: tuple[int, int] | None
+) -> tuple[int, NDArray[np.float64]]:
     """One line → class id and (4,) xyxy in fractions."""
     try:
         numbers = [float(word) for word in words]
@@ -429,6 +516,14 @@ def _label(words: list[str], where: str, names: tuple[str, ...] | None) -> tuple
         known = "0 or more" if names is None else f"0..{len(names) - 1}"
         raise DatasetError(f"{where}: the class must be a whole number, {known}, got {words[0]:.100}")
     values = np.array(numbers[1:])
+    if keypoints is not None:
+        count, each = keypoints
+        if len(values) not in (4, 4 + count * each):
+            raise DatasetError(
+                f"{where}: `kpt_shape: [{count}, {each}]` means {5 + count * each} numbers, the class, the "
+                f"box and {count} keypoints of {each}; got {len(words)}"
+            )
+        values = values[:4]
     if len(values) != 4 and (len(values) < 6 or len(values) % 2):
         raise DatasetError(f"{where}: expected `class cx cy w h` or a polygon, got {len(words)} numbers")
     if not all(math.isfinite(value) for value in values):
