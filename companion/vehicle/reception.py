@@ -68,7 +68,7 @@ class Reception:
         self._frames += 1
         if self._sequence is not None:
             missing = (frame.sequence - self._sequence - 1) % 256
-            if missing > 127:  # a datagram that was overtaken, or arrived twice
+            if missing > 127:  # out of order, or a duplicate
                 return
             self._lost += missing
         self._sequence = frame.sequence
