@@ -22,6 +22,7 @@ from vision.calibration.extrinsics import Extrinsics
 from vision.calibration.views import EDGES, ViewCollector
 from vision.camera_model import CameraModel, scaled_to_frames
 from vision.frame import Frame
+from vision.image_file import decode
 from vision.markers import Marker, MarkerDetector, MarkerKind
 from vision.sources import EndOfStream, Source
 from vision.sources.files import images_in
@@ -274,7 +275,7 @@ def write_report(folder: Path, result: CalibrationResult, collected: Collected) 
     folder.mkdir(parents=True, exist_ok=True)
     _save(folder / "corners.png", _corners_image(result))
     largest = max(result.views, key=lambda view: float(np.ptp(view.corners_px, axis=0).prod()))
-    original = _decoded(collected.images[largest.name])
+    original = decode(collected.images[largest.name]).pixels
     _save(folder / "undistorted.jpg", np.hstack([original, undistorted(original, result.model)]))
     rows = []
     views = [
@@ -283,7 +284,7 @@ def write_report(folder: Path, result: CalibrationResult, collected: Collected) 
     ]
     for number, (view, error, rejected) in enumerate(sorted(views, key=lambda item: -item[1])):
         file = f"view{number:02d}.jpg"
-        _save(folder / file, _view_image(_decoded(collected.images[view.name]), view, rejected))
+        _save(folder / file, _view_image(decode(collected.images[view.name]).pixels, view, rejected))
         name = html.escape(view.name) + (" (rejected)" if rejected else "")
         rows.append(
             f'<tr><td><img src="{file}" width="240"></td><td>{name}</td>'
@@ -368,10 +369,6 @@ def _small(image: Image) -> tuple[Image, float]:
     return np.asarray(
         cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8
     ), scale
-
-
-def _decoded(data: bytes) -> Image:
-    return np.asarray(cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR), np.uint8)
 
 
 def _save(path: Path, image: Image) -> None:

@@ -27,6 +27,7 @@ from companion.recording.frames import DetectedFrame
 from companion.settings import ZenohSection
 from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
 from vision.evaluation.datasets import fold_name
+from vision.image_file import decode_image
 from vision.plain_yaml import load_plain_yaml
 from vision.text_file import read_text
 
@@ -220,9 +221,9 @@ def live_frames(
                     f"{vehicle}: detections are drawn into its images: set preview.annotate = false"
                 )
             found = waiting.get(stamp_ns)
-            image = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+            image = decode_image(payload)
             if found is not None and image is not None:
-                yield DetectedFrame(stamp_ns, image.astype(np.uint8, copy=False), found)
+                yield DetectedFrame(stamp_ns, image, found)
         for subscriber in subscribers:
             subscriber.undeclare()  # type: ignore[no-untyped-call]
 

@@ -22,9 +22,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vision.annotate import annotate
 from vision.detections import TRACK_CONFIRMED, DetectionRecord, Detections
 from vision.frame import Frame
+from vision.image_file import is_image
 from vision.pipeline import FrameDetector
 from vision.sources import Source
-from vision.sources.files import is_image
 from vision.tracking import Tracker, TrackerSettings
 
 logger = logging.getLogger(__name__)

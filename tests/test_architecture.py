@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
 
@@ -145,6 +146,8 @@ COPIES_OF_PAYLOADS = {
     "mavlink_sim/faults/injector.py": 1,
     "mavlink_sim/services/file_transfer.py": 1,
 }
+# Depth keeps its 16 bits or floats.
+DECODE_IMAGE_FILES = {"vision/image_file.py", "vision/sources/depth_images.py"}
 SERVICE, MAX_SERVICE_LINES = ROOT / "companion" / "service", 250
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
@@ -470,3 +473,12 @@ def test_only_one_function_copies_what_a_peer_sent() -> None:
 )
 def test_an_unbounded_copy_is_found(text: str) -> None:
     assert _unbounded_copies(ast.parse(text)) == [1]
+
+
+def test_image_files_are_decoded_in_one_place() -> None:
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in modules().values()
+        if re.search(r"\bcv2\.(imdecode|imread)", path.read_text())
+    }
+    assert found == DECODE_IMAGE_FILES

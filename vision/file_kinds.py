@@ -9,6 +9,7 @@ import re
 from pathlib import Path
 
 _HEAD_BYTES = 65_536
+_HEIC = "is a HEIC image, as iPhones take: convert it to JPEG"
 _MAGIC: tuple[tuple[bytes, int, str], ...] = (
     (b"\xff\xd8\xff", 0, "is a JPEG image"),
     (b"\x89PNG\r\n\x1a\n", 0, "is a PNG image"),
@@ -16,6 +17,9 @@ _MAGIC: tuple[tuple[bytes, int, str], ...] = (
     (b"II*\0", 0, "is a TIFF image"),
     (b"MM\0*", 0, "is a TIFF image"),
     (b"WEBP", 8, "is a WebP image"),
+    (b"\0\0\0\x0cjP  \r\n", 0, "is a JPEG 2000 image"),
+    *((b"ftyp" + brand, 4, _HEIC) for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")),
+    *((b"ftyp" + brand, 4, "is an AVIF image") for brand in (b"avif", b"avis")),
     (b"AVI ", 8, "is a video (AVI)"),
     (b"ftyp", 4, "is a video (MP4)"),
     (b"\x1aE\xdf\xa3", 0, "is a video (Matroska, WebM)"),

@@ -236,17 +236,14 @@ def _object(detection: DetectionBody, yaw_rad: float | None) -> SceneObject:
 
 def _colours(jpeg: bytes, frame: DetectionsBody) -> list[str | None]:
     """The colour of each detection. The preview may be smaller than the frame."""
-    import cv2
-    import numpy as np
-
     from vision.colour import colour_of
+    from vision.image_file import decode_image
 
-    image = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    image = decode_image(jpeg)
     if image is None:
         return [None] * len(frame["detections"])
     scale = image.shape[1] / frame["width"]
-    pixels = image.astype(np.uint8, copy=False)
-    return [colour_of(pixels, [edge * scale for edge in each["xyxy"]]) for each in frame["detections"]]
+    return [colour_of(image, [edge * scale for edge in each["xyxy"]]) for each in frame["detections"]]
 
 
 def _rounded(value: float | None) -> float | None:

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +16,7 @@ from companion.bus.topics import DEPTH_IMAGE, DETECTIONS, IMAGE
 from companion.recording import RecordingError
 from companion.recording.convert import DEPTH_ENCODING, RUN_CHANNEL
 from companion.recording.files import RecordingReader
+from vision.image_file import decode_image
 from vision.sources.depth_images import to_metres
 
 # Some seconds of frames.
@@ -101,11 +101,11 @@ def _decoded(
     captured_ns: int, image: Any, message: Any, topic: str, depth: tuple[Path, Any] | None
 ) -> Iterator[DetectedFrame]:
     """Decode one frame; a damaged image is left out. `topic`, `depth`: of its depth image, with its file."""
-    pixels = cv2.imdecode(np.frombuffer(base64.b64decode(image["data"]), np.uint8), cv2.IMREAD_COLOR)
+    pixels = decode_image(base64.b64decode(image["data"]))
     if pixels is None:
         return
     depth_m = None if depth is None else _depth_m(*depth, topic, message["width"], message["height"])
-    yield DetectedFrame(captured_ns, pixels.astype(np.uint8, copy=False), message, image["format"], depth_m)
+    yield DetectedFrame(captured_ns, pixels, message, image["format"], depth_m)
 
 
 def _depth_m(path: Path, body: Any, topic: str, width: int, height: int) -> NDArray[np.float32]:

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import pytest
 
+from vision.image_file import natural_key
 from vision.sources import EndOfStream, SourceError, SourceSettings, open_source
-from vision.sources.files import natural_key
 from vision.sources.source import SourceStatistics
 
 pytestmark = pytest.mark.realtime

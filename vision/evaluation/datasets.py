@@ -19,11 +19,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision import image_file
 from vision.file_kinds import explained
+from vision.image_file import is_hidden, is_image
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
 
@@ -31,7 +32,6 @@ logger = logging.getLogger(__name__)
 
 _Label = TypeVar("_Label", bound=Hashable)
 
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 _TABLE_NAMES = ("data.yaml", "data.yml", "dataset.yaml")
 _SPLITS = ("val", "test", "train")
 # Labels are written with six digits, so a box at the edge may exceed it by this much.
@@ -145,29 +145,22 @@ def fold_name(name: str) -> str:
 
 
 def image_files(folder: Path) -> list[Path]:
-    """Every image below `folder`, by name."""
+    """Every image below `folder`, by name, without hidden files and folders."""
     return sorted(_images_below(folder))
 
 
 def _images_below(folder: Path) -> Iterator[Path]:
     for where, folders, names in os.walk(folder):
-        folders.sort()
-        # macOS adds `._NAME` files, which are no images.
-        shown = (name for name in names if not name.startswith("._"))
-        yield from (Path(where, name) for name in shown if Path(name).suffix.lower() in IMAGE_SUFFIXES)
+        folders[:] = sorted(name for name in folders if not is_hidden(Path(name)))
+        yield from (Path(where, name) for name in names if is_image(Path(name)))
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:
     """(height, width, 3) uint8 BGR, rotated by its EXIF orientation; raises `DatasetError`."""
-    # Decoded from memory: OpenCV crashes on a name that is not UTF-8.
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read ({error.strerror or error})") from None
-    image = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if image is None:
-        raise DatasetError(f"{path}: cannot be read as an image; it may be truncated")
-    return image.astype(np.uint8, copy=False)
+        return image_file.read_image(path)
+    except image_file.ImageError as error:
+        raise DatasetError(f"{path}: {error}") from None
 
 
 def find_annotations(folder: Path, split: str | None = None) -> Path | None:
@@ -375,9 +368,9 @@ def _check_labels_have_images(images: list[Path], root: Path) -> None:
     for labels, folder in {(_labels_path(image, root).parent, image.parent) for image in images}:
         if labels == folder or not labels.is_dir():
             continue
-        shown = {image.stem for image in folder.iterdir() if image.suffix.lower() in IMAGE_SUFFIXES}
+        shown = {image.stem for image in folder.iterdir() if is_image(image)}
         for path in sorted(labels.glob("*.txt")):
-            if path.name.startswith("._"):
+            if is_hidden(path):
                 continue
             if path.stem not in shown and path.name != "classes.txt":  # labelling programs list the names
                 raise DatasetError(

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.extras import install_command
+from vision.file_kinds import kind_of_bytes
+from vision.image_file import ImageError
 from vision.sources.source import SourceError
 
 DEPTH_SUFFIXES = frozenset((".png", ".pgm", ".tif", ".tiff", ".exr", ".npy"))
@@ -21,11 +23,30 @@ IMPLAUSIBLE_MEDIAN_M = 200.0
 # The channel of depth in an OpenEXR file with several, as renderers name it. Files with layers have the
 # layer's name and a dot before it.
 _EXR_CHANNEL = "Z"
+_DEPTH_KINDS = ("is a PNG", "is a TIFF", "is an array of NumPy")
 
 
 def is_depth_image(path: Path) -> bool:
     """Whether the file name has the suffix of a depth image."""
     return path.suffix.lower() in DEPTH_SUFFIXES
+
+
+def read_depth(path: Path) -> NDArray[Any]:
+    """`decode_depth` of a file.
+
+    Raises:
+        ImageError: it cannot be read. SourceError: as `decode_depth`.
+    """
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise ImageError(f"cannot be read: {error.strerror or error}") from None
+    image = decode_depth(path, data)
+    if image is None:
+        problem = "not a depth image that can be read; it may be truncated or damaged"
+        kind = kind_of_bytes(data[:65_536])
+        raise ImageError(problem if kind is None or kind.startswith(_DEPTH_KINDS) else kind)
+    return image
 
 
 def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:

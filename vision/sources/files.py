@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.file_kinds import explained, has_no_index
+from vision.image_file import IMAGE_SUFFIXES, ImageError, is_hidden, natural_key, read_image
 from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
@@ -22,30 +22,19 @@ logger = logging.getLogger(__name__)
 
 _CAP_PROP_PTS = 71  # stamp in frame intervals; its name is missing before OpenCV 4.11, where it is 0
 
-IMAGE_SUFFIXES = frozenset(
-    (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif")
-)
-
-
-def is_image(path: Path) -> bool:
-    """Whether the file name has an image suffix."""
-    return path.suffix.lower() in IMAGE_SUFFIXES
-
-
-def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
-    """Sort key of natural order: image2 before image10."""
-    parts = re.split(r"(\d+)", path.name.casefold())
-    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part)
-
 
 def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[Path]:
-    """The images directly in a folder, in natural order.
+    """The images directly in a folder, in natural order, without hidden ones.
 
     Raises:
         SourceError: there are none.
     """
     paths = sorted(
-        (path for path in folder.iterdir() if path.suffix.lower() in suffixes and path.is_file()),
+        (
+            path
+            for path in folder.iterdir()
+            if path.suffix.lower() in suffixes and not is_hidden(path) and path.is_file()
+        ),
         key=natural_key,
     )
     if not paths:
@@ -53,41 +42,6 @@ def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[P
             f"{folder}: no images in this folder; expected names ending in {', '.join(sorted(suffixes))}"
         )
     return paths
-
-
-# Of these the decoder knows more than the kind of file.
-_IMAGES = tuple(f"is a {kind} image" for kind in ("JPEG", "PNG", "GIF", "TIFF", "WebP"))
-
-
-def decode_image(data: bytes) -> NDArray[np.uint8] | None:
-    """(height, width, 3) BGR of an encoded image, rotated by its EXIF orientation; None if unreadable."""
-    if not data:
-        return None
-    try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-    except cv2.error:  # a size beyond OpenCV's limits
-        return None
-    return None if image is None else np.ascontiguousarray(image, dtype=np.uint8)
-
-
-def unreadable_reason(data: bytes) -> str:
-    """Why `decode_image` cannot read these bytes."""
-    try:
-        raw = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except cv2.error as error:
-        if "CV_IO_MAX_IMAGE" not in str(error):
-            return f"cannot be decoded: {error.err}"
-        size = ""
-        if data.startswith(b"\x89PNG"):
-            size = f"{int.from_bytes(data[16:20], 'big')}x{int.from_bytes(data[20:24], 'big')} pixels, "
-        return f"{size}more than OpenCV's limit of 2^30 pixels, 2^20 a side; cut it into tiles"
-    if raw is not None and raw.dtype.kind == "f":
-        return f"{raw.itemsize * 8}-bit floats are not an image of colours; convert it to 8 bits"
-    return "not an image that can be read; it may be truncated or damaged"
-
-
-def _decode_colour(_path: Path, data: bytes) -> NDArray[np.uint8] | None:
-    return decode_image(data)
 
 
 def partners(images: list[Path], depths: list[Path]) -> list[Path | None]:
@@ -122,17 +76,17 @@ class ImagesCapture(Capture):
 
     Args:
         paths: the images; None: no image for this interval.
-        decode: returns the image of a file's bytes, None if unreadable.
+        read: returns the image of a file; raises ImageError.
     """
 
     def __init__(
         self,
         paths: Sequence[Path | None],
         rate_hz: float,
-        decode: Callable[[Path, bytes], NDArray[Any] | None] = _decode_colour,
+        read: Callable[[Path], NDArray[Any]] = read_image,
     ) -> None:
         quiet_opencv()
-        self._decode = decode
+        self._read_image = read
         self._paths = [(index, path) for index, path in enumerate(paths) if path is not None]
         self.interval_s = 1 / rate_hz
         self._next = 0
@@ -144,19 +98,16 @@ class ImagesCapture(Capture):
             self._next += 1
             started_ns = time.monotonic_ns()
             try:
-                data = path.read_bytes()
-                image = self._decode(path, data)
-                reason = "" if image is not None else unreadable_reason(data)
-            except OSError as error:
-                image, reason = None, error.strerror or str(error)
-            if image is not None:
-                decode_ms = (time.monotonic_ns() - started_ns) / 1e6
-                media_s = index * self.interval_s
-                return RawFrame(image, media_s=media_s, decode_ms=decode_ms, file_name=path.name)
-            self.unreadable += 1
-            if self.total_frames == 1:
-                raise SourceError(explained(path, f"{path}: {reason}", *_IMAGES))
-            logger.warning("%s: skipped: %s", path, reason)
+                image = self._read_image(path)
+            except ImageError as error:
+                self.unreadable += 1
+                if self.total_frames == 1:
+                    raise SourceError(f"{path}: {error}") from None
+                logger.warning("%s: skipped: %s", path, error)
+                continue
+            decode_ms = (time.monotonic_ns() - started_ns) / 1e6
+            media_s = index * self.interval_s
+            return RawFrame(image, media_s=media_s, decode_ms=decode_ms, file_name=path.name)
         if self.unreadable == len(self._paths):
             raise SourceError(f"{self._paths[0][1]}: none of the {len(self._paths)} images could be read")
         raise EndOfStream

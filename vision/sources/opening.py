@@ -14,14 +14,15 @@ from pathlib import Path
 
 from vision.calibration.camera_info import read_registration
 from vision.home import expanded
+from vision.image_file import is_image
 from vision.redaction import without_password
 from vision.registry import shown
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
 from vision.sources.csi import CsiCapture, check_csi_program, csi_settings, parse_csi_number
 from vision.sources.depth_cameras import OakCapture, RealsenseCapture, load_module
-from vision.sources.depth_images import DEPTH_SUFFIXES, decode_depth, is_depth_image
-from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, is_image, partners
+from vision.sources.depth_images import DEPTH_SUFFIXES, is_depth_image, read_depth
+from vision.sources.files import ImagesCapture, VideoFileCapture, images_in, partners
 from vision.sources.latest import LatestSource
 from vision.sources.network import UdpStream, check_user_info, open_http, open_rtsp
 from vision.sources.opencv import quiet_opencv
@@ -197,7 +198,7 @@ def open_two(
         rate_hz, images = _image_rate_hz(second_settings), images_in(folder)
         if second_settings.as_depth:
             paths = partners(images, images_in(second_folder, DEPTH_SUFFIXES))
-            capture = partial(ImagesCapture, paths, rate_hz, decode_depth)
+            capture = partial(ImagesCapture, paths, rate_hz, read_depth)
         else:
             paths = partners(images, images_in(second_folder))
             capture = partial(ImagesCapture, paths, rate_hz)
@@ -355,7 +356,7 @@ def _folder(uri: str) -> Path | None:
 
 def _depth_images(path: Path, settings: SourceSettings) -> ImagesCapture:
     paths = images_in(path, DEPTH_SUFFIXES) if path.is_dir() else [path]
-    return ImagesCapture(paths, _image_rate_hz(settings), decode_depth)
+    return ImagesCapture(paths, _image_rate_hz(settings), read_depth)
 
 
 def _open_file(name: str, open_capture: Callable[[], Capture], settings: SourceSettings) -> Source:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.sources.files import decode_image
+from vision.image_file import decode_image
 from vision.sources.source import RAW_PIXEL_FORMATS
 
 logger = logging.getLogger(__name__)

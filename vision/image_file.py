@@ -1,0 +1,243 @@
+"""Reads image files as 8-bit BGR: the one place that decodes them, for sources, data sets and messages.
+
+An alpha channel is left out, as OpenCV and Ultralytics do. 16 bits become 8 by their upper byte; values that
+use less than half of the 16-bit range, such as a thermal camera's counts of 14 bits, are stretched, since
+their upper bytes are nearly black.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vision.file_kinds import kind_of_bytes
+
+logger = logging.getLogger(__name__)
+
+IMAGE_SUFFIXES = frozenset(
+    (
+        *(".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif"),
+        *(".heic", ".heif"),
+    )
+)
+"""HEIC is not read, but is named where it is found."""
+
+# Of these the decoder knows more than the kind of file.
+_AVIF = "is an AVIF image"
+_KINDS = (*(f"is a {kind} image" for kind in ("JPEG", "PNG", "GIF", "TIFF", "WebP", "JPEG 2000")), _AVIF)
+# Values that span less of the 16-bit range are stretched. Dead and hot pixels do not count: this share of the
+# pixels at each end, 300 of a 640x512 image.
+_STRETCHED_BELOW, _IGNORED_PERCENT = 1 << 15, 0.1
+_MOST_SAMPLES = 1 << 20
+# libjpeg looks ahead by so many bytes. Without an end behind them it stops, quietly, where rows are missing.
+_JPEG_LOOK_AHEAD = bytes(9)
+_PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
+_TIFF = {b"II*\0": "little", b"MM\0*": "big"}
+_SUBFILE_TYPE, _NO_PAGE = 254, 1 | 4  # TIFF 6.0: reduced images and masks
+
+
+class ImageError(ValueError):
+    """An image that cannot be read; the text is the reason, to be put after the file's name."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecodedImage:
+    """A decoded image.
+
+    Attributes:
+        pixels: (height, width, 3) uint8, BGR, rotated by its EXIF orientation.
+        note: what the pixels do not show as the file has it; empty: nothing.
+    """
+
+    pixels: NDArray[np.uint8]
+    note: str = ""
+
+
+def is_image(path: Path) -> bool:
+    """Whether the file name has an image suffix, and is not hidden."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(path)
+
+
+def is_hidden(path: Path) -> bool:
+    """Whether the name begins with a dot, as those that macOS adds (`._NAME`)."""
+    return path.name.startswith(".")
+
+
+def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:
+    """Sort key of natural order: image2 before image10."""
+    parts = re.split(r"(\d+)", path.name.casefold())
+    return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts if part)
+
+
+def read_image(path: Path) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 BGR of a file, rotated by its EXIF orientation.
+
+    A note about it is logged for the first such image of a folder.
+
+    Raises:
+        ImageError: it cannot be read.
+    """
+    try:
+        data = path.read_bytes()  # decoded from memory: OpenCV crashes on a name that is not UTF-8
+    except OSError as error:
+        raise ImageError(f"cannot be read: {error.strerror or error}") from None
+    image = decode(data)
+    if image.note and (noted := (path.absolute().parent, re.sub(r"\d+", "", image.note))) not in _noted:
+        _noted.add(noted)
+        logger.warning("%s: %s; said once a folder", path, image.note)
+    return image.pixels
+
+
+_noted: set[tuple[Path, str]] = set()
+"""Folders, with the notes that were logged for them, without their numbers."""
+
+
+def decode_image(data: bytes) -> NDArray[np.uint8] | None:
+    """The pixels of `decode`; None if it cannot be read, as one of a stream of images."""
+    try:
+        return decode(data).pixels
+    except ImageError:
+        return None
+
+
+def decode(data: bytes) -> DecodedImage:
+    """Decode an image file. A JPEG or PNG that lacks nothing but its end is whole.
+
+    Raises:
+        ImageError: it is no image, not one of colours, or pixels are missing.
+    """
+    notes = []
+    if data.startswith(_PNG):
+        data, images = _whole_png(data)
+        if images > 1:
+            notes.append(f"is an animation of {images} images: its first one is read")
+    image = _decoded(data)
+    if image is None:
+        whole, note = _whole_jpeg(data)
+        notes += [note] * bool(note)
+        image = _decoded(whole)
+    if image is None or image.itemsize > 2:
+        raise ImageError(_unreadable(data, image))
+    if image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    if image.dtype != np.uint8:
+        image, note = _eight_bits(image)
+        notes += [note] * bool(note)
+    if data.startswith(b"RIFF") and data[12:16] == b"VP8X" and data[20] & 2:
+        notes.append("is an animation: its first image is read")
+    elif (order := _TIFF.get(data[:4])) and (pages := _pages(data, order)) > 1:
+        notes.append(f"has {pages} pages: its first one is read")
+    return DecodedImage(np.ascontiguousarray(image, dtype=np.uint8), "; ".join(notes))
+
+
+def _decoded(data: bytes) -> NDArray[Any] | None:
+    if not data:
+        return None
+    try:
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error as error:
+        if "CV_IO_MAX_IMAGE" not in str(error):
+            return None
+    size = "{}x{} pixels, ".format(*_png_size(data)) if data.startswith(_PNG) else ""
+    raise ImageError(f"{size}more than OpenCV's limit of 2^30 pixels, 2^20 a side; cut it into tiles")
+
+
+def _png_size(data: bytes) -> tuple[int, int]:
+    return int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+
+
+def _whole_png(data: bytes) -> tuple[bytes, int]:
+    """The file with its end, and the number of its images (APNG)."""
+    if 0 in _png_size(data):
+        raise ImageError("states a size of {}x{} pixels; make it again".format(*_png_size(data)))
+    at, images = len(_PNG), 1
+    while (kind := data[at + 4 : at + 8]) != b"IEND":
+        if kind == b"acTL":
+            images = int.from_bytes(data[at + 8 : at + 12], "big")
+        after = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if len(data) < at + 12 or len(data) < after:
+            break
+        at = after
+    if (rest := data[at:]).startswith(_PNG_END):
+        return data, images
+    if _PNG_END.startswith(rest):
+        return data[:at] + _PNG_END, images
+    raise ImageError("is a PNG image that ends too early: pixels are missing; copy or download it again")
+
+
+def _whole_jpeg(data: bytes) -> tuple[bytes, str]:
+    """A JPEG without its end, completed, with a note; empty for another file."""
+    if not data.startswith(b"\xff\xd8") or data.endswith(b"\xff\xd9"):
+        return b"", ""
+    if _is_progressive(data):
+        return data + b"\xff\xd9", "is a JPEG without its end: it may be coarser, or lack rows"
+    if _decoded(data + _JPEG_LOOK_AHEAD) is None:
+        raise ImageError("is a JPEG image that ends too early: rows are missing; copy or download it again")
+    return data + _JPEG_LOOK_AHEAD, ""
+
+
+def _is_progressive(data: bytes) -> bool:
+    """By the frame header (ITU-T T.81, B.2.2)."""
+    at = 2
+    while len(data) >= at + 4 and data[at] == 0xFF and data[at + 1] != 0xDA:
+        if data[at + 1] == 0xC2:
+            return True
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
+
+
+def _unreadable(data: bytes, image: NDArray[Any] | None) -> str:
+    """Why these bytes are no image of colours, although they may hold an image of more than 16 bits."""
+    if image is None and data[:4] in _TIFF:
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if image is not None and image.itemsize > 2:
+        what = "floats" if image.dtype.kind == "f" else "integers"
+        return f"{image.itemsize * 8}-bit {what} are not an image of colours; convert it to 8 bits"
+    kind = kind_of_bytes(data[:65_536])
+    if kind is not None and not kind.startswith(_KINDS):
+        return kind
+    if kind == _AVIF:
+        return f"{_AVIF}: damaged, or this OpenCV cannot read them; convert it to JPEG or PNG"
+    return "not an image that can be read; it may be truncated or damaged"
+
+
+def _eight_bits(image: NDArray[Any]) -> tuple[NDArray[np.uint8], str]:
+    """16-bit integers, signed or not, as 8 bits, with a note if they were stretched."""
+    offset = 0
+    if image.dtype.kind == "i":  # two's complement → the same order, unsigned
+        image, offset = image.view(np.uint16) ^ np.uint16(0x8000), 0x8000
+    step = int(np.ceil(np.sqrt(image.size / _MOST_SAMPLES)))
+    share = (_IGNORED_PERCENT, 100.0 - _IGNORED_PERCENT)
+    low, high = np.percentile(image[::step, ::step], share).round().astype(int).tolist()
+    if not 0 < high - low < _STRETCHED_BELOW:
+        return (image >> 8).astype(np.uint8), ""
+    table = np.clip((np.arange(1 << 16) - low) * (255.0 / (high - low)), 0.0, 255.0)
+    note = (
+        f"16-bit image with values {int(image.min()) - offset} to {int(image.max()) - offset}: "
+        f"{low - offset} to {high - offset} are stretched to 0 to 255"
+    )
+    return table.round().astype(np.uint8)[image], note
+
+
+def _pages(data: bytes, order: Any) -> int:
+    """Number of a TIFF file's pages (TIFF 6.0, section 2), without its smaller copies and masks."""
+
+    def number(at: int, size: int) -> int:
+        return int.from_bytes(data[at : at + size], order)
+
+    pages, at, seen = 0, number(4, 4), set[int]()
+    while 0 < at < len(data) and at not in seen:
+        seen.add(at)
+        entries = number(at, 2)
+        fields = (at + 2 + 12 * index for index in range(entries))
+        kind = next((number(field + 8, 4) for field in fields if number(field, 2) == _SUBFILE_TYPE), 0)
+        pages += not kind & _NO_PAGE
+        at = number(at + 2 + 12 * entries, 4)
+    return pages
