@@ -37,11 +37,11 @@ from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_pairs, b
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.calibration.boards import Board
-from vision.calibration.calibrate import CalibrationResult, calibrate, covers_image
+from vision.calibration.calibrate import CalibrationResult, calibrate
 from vision.calibration.extrinsics import extrinsics_from_views
 from vision.calibration.mount import mount_from_markers
 from vision.calibration.views import ViewCollector
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraModel, CameraMount, pixels_without_rays
 from vision.markers import Marker, MarkerDetector, MarkerKind
 from vision.rotation import matrix_from_euler
 
@@ -109,7 +109,7 @@ def random_lens(seed: int) -> tuple[str, CameraModel]:
             cy=lens.cy + float(centre[1]),
             distortion=tuple(float(value) for value in np.array(lens.distortion) * rng.uniform(0.8, 1.2)),
         )
-        if covers_image(changed):
+        if not pixels_without_rays(changed):
             return name, changed
 
 

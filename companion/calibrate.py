@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from companion.bus.topics import VEHICLE
 from vision.attitude import euler_from_quaternion
 from vision.calibration.boards import Board, BoardView
-from vision.calibration.calibrate import CalibrationError, CalibrationResult, covers_image
+from vision.calibration.calibrate import CalibrationError, CalibrationResult
 from vision.calibration.extrinsics import Extrinsics
 from vision.calibration.views import EDGES, ViewCollector
-from vision.camera_model import CameraModel, scaled_to_frames
+from vision.camera_model import CameraModel, pixels_without_rays, scaled_to_frames
 from vision.frame import Frame
 from vision.image_file import decode
 from vision.markers import Marker, MarkerDetector, MarkerKind
@@ -249,7 +249,7 @@ def result_lines(result: CalibrationResult) -> list[str]:
         f"cx {model.cx:.2f} +- {sigmas[2]:.2f}, cy {model.cy:.2f} +- {sigmas[3]:.2f} px (one sigma)",
         f"distortion {', '.join(f'{value:.5f}' for value in model.coefficients)}",
         f"reprojection {result.rms_px:.3f} px RMS; on held-out views: {held_out}",
-        *(() if covers_image(model) else ("the image's corners have no rays: add views of the board there",)),
+        *filter(None, (pixels_without_rays(model),)),
     ]
 
 

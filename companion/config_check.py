@@ -39,7 +39,7 @@ def check_settings(settings: Settings) -> list[str]:
     """Check what the settings name, as this user and without loading a model or opening a device.
 
     Returns:
-        What is missing now and may come later, one line each.
+        What is missing now and may come later, and what a lens does not see, one line each.
 
     Raises:
         ConfigurationError: every setting that is wrong, one line each.
@@ -132,6 +132,8 @@ class _Check:
         self._source(f"{prefix}source.uri", source.uri, source)
         if source.depth is not None:
             self._source(f"{prefix}source.depth", source.depth, source)
+        if problem := settings.camera.lens_problem():
+            self.missing.append(f"{prefix}camera: {problem}")
         if detector.enabled:
             with self.fault(f"{prefix}detector"):
                 check_detector(detector.kind, detector.loading(detector.confidence))

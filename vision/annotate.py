@@ -159,9 +159,11 @@ def annotate_markers(
         outline = _subpixels(marker.corners_px)
         cv2.polylines(drawn, [outline], True, _LIGHT, sizes.line, cv2.LINE_AA, _SHIFT)
         ends = marker.position_camera_m + np.vstack([np.zeros(3), marker.rotation.T * marker.size_m / 2])
-        centre, *tips = _subpixels(camera.project(ends))
+        seen = camera.project(ends)
+        centre, *tips = _subpixels(np.nan_to_num(seen))
         for tip, colour in zip(tips, _AXIS_COLOURS, strict=True):
-            cv2.line(drawn, centre, tip, colour, sizes.line, cv2.LINE_AA, _SHIFT)
+            if np.isfinite(seen).all():  # else one is beyond the lens's fold
+                cv2.line(drawn, centre, tip, colour, sizes.line, cv2.LINE_AA, _SHIFT)
         text = f"{marker.identifier}  {float(np.linalg.norm(marker.position_camera_m)):.2f} m"
         (width, height), baseline = cv2.getTextSize(text, _FONT, sizes.font_scale, sizes.stroke)
         outlined = np.array([marker.corners_px.min(axis=0), marker.corners_px.max(axis=0)], np.float32)

@@ -120,8 +120,8 @@ class CameraModel:
     def project(self, points_optical: NDArray[Any]) -> NDArray[np.float64]:
         """(N, 3) points in the optical frame → (N, 2) pixels; NaN for points that the lens cannot see.
 
-        A pinhole camera sees what is in front of it; a fisheye what is within the angle from its axis up to
-        which its polynomial ascends.
+        A pinhole camera sees what is in front of it, a fisheye also what is behind; both within the angle
+        from the axis up to which their distortion ascends: from there on it would fold the image back.
         """
         points = np.asarray(points_optical, np.float64).reshape(-1, 3)
         if self.distortion_model == EQUIDISTANT:
@@ -135,7 +135,9 @@ class CameraModel:
             return pixels
         plane = points[:, :2] / np.where(points[:, 2:] > 1e-9, points[:, 2:], np.nan)
         if self.distortion:
-            plane = _distorted(self.distortion, plane)
+            plane = np.where(
+                _unfolded(self.distortion, plane)[:, None], _distorted(self.distortion, plane), np.nan
+            )
         return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
@@ -164,6 +166,31 @@ def scaled_to_frames(model: CameraModel, width: int, height: int) -> CameraModel
             f"{width}x{height}, another aspect: calibrate with such frames, or set the width and height"
         )
     return model.scaled(width, height)
+
+
+def pixels_without_rays(model: CameraModel) -> str:
+    """Where a lens gives pixels of its image no rays, as a sentence with what to do; empty: nowhere.
+
+    Beyond 90 degrees from the axis of a fisheye nothing is missing: its image is a circle.
+    """
+    x, y = (np.linspace(0, side - 1, 9) for side in (model.width, model.height))
+    edge = np.array([(a, b) for a in x for b in (y[0], y[-1])] + [(a, b) for a in (x[0], x[-1]) for b in y])
+    fisheye = model.distortion_model == EQUIDISTANT
+    largest = _max_theta(model.distortion) if fisheye else _max_radius(model.coefficients)
+    if np.isfinite(model.rays(edge)).all() or (fisheye and largest >= math.pi / 2):
+        return ""
+    farthest_px = np.sqrt(((edge - (model.cx, model.cy)) ** 2).sum(axis=1)).max()
+    angle_rad = largest if fisheye else math.atan(largest)
+    inside_rad = 0.999 * angle_rad
+    rim_px = model.project(np.array([[math.sin(inside_rad), 0.0, math.cos(inside_rad)]]))[0, 0] - model.cx
+    place = f" {rim_px:.0f} px from its centre ({math.degrees(angle_rad):.0f} degrees from the axis)"
+    if not math.isfinite(rim_px):  # a tangential distortion that folds it before
+        place = ""
+    return (
+        f"the distortion ({model.distortion_model}) folds the image{place}, and its corners are up to "
+        f"{farthest_px:.0f} px away: pixels beyond have no direction, and objects there no position; "
+        f"calibrate with views of the board there"
+    )
 
 
 def check_distortion(model: str, coefficients: tuple[float, ...]) -> None:
@@ -204,20 +231,46 @@ def _slopes(
     return across, mixed, along
 
 
+@lru_cache(maxsize=16)
+def _max_radius(coefficients: tuple[float, ...]) -> float:
+    """Distance from the axis at unit depth up to which a pinhole camera's radial distortion ascends."""
+    k1, k2, _, _, k3, k4, k5, k6 = (*coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
+    # In the squared radius: the numerator of the slope, and the divisor.
+    under = [k6, k5, k4, 1.0]
+    slope = np.polysub(
+        np.polymul([7 * k3, 5 * k2, 3 * k1, 1.0], under),
+        np.polymul([2 * k3, 2 * k2, 2 * k1, 2.0, 0.0], [3 * k6, 2 * k5, k4]),
+    )
+    roots = [complex(root) for each in (slope, under) for root in np.roots(each)]
+    squares = [root.real for root in roots if abs(root.imag) < 1e-12 and root.real > 0.0]
+    return math.sqrt(min(squares, default=math.inf))
+
+
+def _unfolded(coefficients: tuple[float, ...], plane: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) whether the distortion of points at unit depth is within the first fold of the image."""
+    xx, xy, yy = _slopes(coefficients, plane)
+    within: NDArray[np.bool_] = (plane * plane).sum(axis=1) <= _max_radius(coefficients) ** 2
+    return within & (xx > 0.0) & (xx * yy - xy * xy > 0.0)
+
+
 def _undistorted(
     coefficients: tuple[float, ...], wanted: NDArray[np.float64], plane: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Newton's method from `plane`; NaN where it does not converge, and where the image is folded."""
+    largest = _max_radius(coefficients)
     with np.errstate(all="ignore"):
+        plane = np.where(np.isfinite(plane), plane, wanted)
         for _ in range(_MAX_STEPS):
+            radius = np.sqrt((plane * plane).sum(axis=1, keepdims=True))
+            plane = plane * np.minimum(1.0, largest / radius)
             error = _distorted(coefficients, plane) - wanted
-            xx, xy, yy = _slopes(coefficients, plane)
-            determinant = xx * yy - xy * xy
-            found = (np.abs(error) < _INVERTED).all(axis=1) & (determinant > 0.0) & (xx > 0.0)
+            found = np.abs(error).max(axis=1) < _INVERTED
             if found.all():
                 break
+            xx, xy, yy = _slopes(coefficients, plane)
             step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]])
-            plane = np.where(found[:, None], plane, plane - step / determinant[:, None])
+            plane = np.where(found[:, None], plane, plane - step / (xx * yy - xy * xy)[:, None])
+        found &= _unfolded(coefficients, plane)
     return np.where(found[:, None], plane, np.nan)
 
 
@@ -245,12 +298,16 @@ def _equidistant_rays(coefficients: tuple[float, ...], plane: NDArray[np.float64
     largest = _max_theta(coefficients)
     radius = np.sqrt((plane * plane).sum(axis=1))
     theta = np.minimum(radius, largest)
+    low, high = np.zeros_like(theta), np.full_like(theta, largest)
     with np.errstate(all="ignore"):
-        for _ in range(_MAX_STEPS):
+        for _ in range(2 * _MAX_STEPS):
             reached, slope = _equidistant(coefficients, theta)
             if (np.abs(reached - radius) < _INVERTED / 100).all():
                 break
-            theta = np.clip(theta - (reached - radius) / slope, 0.0, largest)
+            # Newton's step, or half of what is left where that leads out of it.
+            low, high = np.where(reached < radius, theta, low), np.where(reached < radius, high, theta)
+            step = theta - (reached - radius) / slope
+            theta = np.where((step >= low) & (step <= high), step, (low + high) / 2)
         theta[np.abs(_equidistant(coefficients, theta)[0] - radius) > _INVERTED] = np.nan
         sine = np.where(radius > 0.0, np.sin(theta) / radius, 1.0)
     return np.column_stack([plane * sine[:, None], np.cos(theta)])

@@ -17,8 +17,6 @@ Array = NDArray[np.float32]
 # depth through its points at these, 1/m: to 0.02 px from 0.4 m on, and to 0.4 px at 0.25 m, for two cameras
 # 5 cm apart with the lenses of `mavlink-sim board`.
 _INVERSE_DEPTHS = (0.0, 1.25, 2.5)
-# Beyond the angle that its coefficients describe a lens folds: there a point's pixel has another ray.
-_SAME_RAY = 1e-3
 # A depth pixel covers this much more than its own size, so that surfaces seen from the side have no gaps.
 _LARGER = 0.25
 # Of a pixel's own point and the nearest one that covers it, the latter is taken if the former is farther by
@@ -74,7 +72,7 @@ class _Table:
         # At a depth of 1: depth is measured along the axis.
         rays = (rays / np.where(rays[:, 2:] > 0.0, rays[:, 2:], np.nan)) @ calibration.rotation.T
         first, second, third = (
-            _seen(lens, rays + inverse * calibration.position_m) for inverse in _INVERSE_DEPTHS
+            lens.project(rays + inverse * calibration.position_m) for inverse in _INVERSE_DEPTHS
         )
         step = _INVERSE_DEPTHS[1]
         square = (first - 2 * second + third) / (2 * step**2)
@@ -118,13 +116,3 @@ class _Table:
 
 
 _table = lru_cache(maxsize=4)(_Table)
-
-
-def _seen(lens: CameraModel, points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 2) pixels of points; NaN where the lens does not see them."""
-    pixels = lens.project(points)
-    directions = points / np.linalg.norm(points, axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        same = np.abs(lens.rays(pixels) - directions).max(axis=1) < _SAME_RAY
-    pixels[~same] = np.nan
-    return pixels

@@ -250,6 +250,7 @@ class WorkerCamera(PerceptionCamera):
                 f"source.rotate_deg is 180 and camera.mount_roll_deg {roll_deg:g}: the mount is that of the "
                 f"rotated image; a camera fixed upside down has mount_roll_deg 0",
             )
+        self._check_lens()
         try:
             await self.supervisor.start()
         except PerceptionStartError as error:
@@ -305,7 +306,12 @@ class WorkerCamera(PerceptionCamera):
                     "warning", f"{key}: settings override the camera's calibration: {adopted.conflict}"
                 )
         self.settings = self.settings.model_copy(update={"camera": camera})
+        self._check_lens()
         self._on_calibration()
+
+    def _check_lens(self) -> None:
+        if problem := self.settings.camera.lens_problem():
+            self._event("warning", f"camera: {problem}")
 
     def _event(self, level: str, text: str) -> None:
         self._on_event(level, text if self.name is None else f"camera {self.name}: {text}")

@@ -14,7 +14,14 @@ from companion.settings.marker_files import Print, read_boards, read_map
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.calibration.camera_info import read_camera_info, read_registration
-from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion, scaled_to_frames
+from vision.camera_model import (
+    CameraModel,
+    CameraMount,
+    DistortionModel,
+    check_distortion,
+    pixels_without_rays,
+    scaled_to_frames,
+)
 from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.home import expanded
@@ -224,6 +231,12 @@ class CameraSection(Section):
             self.distortion_model,
         )
         return scaled_to_frames(calibrated, width, height)
+
+    def lens_problem(self) -> str:
+        """Where the image has no rays, in words; empty: nowhere, or there is no calibration."""
+        if self.calibrated_width is None or self.calibrated_height is None:
+            return ""
+        return pixels_without_rays(self.model(self.calibrated_width, self.calibrated_height))
 
     @property
     def field_rad(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import cv2
@@ -11,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vision.camera_model import CameraModel
+from vision.camera_model import DISTORTION_MODELS, CameraModel, DistortionModel, pixels_without_rays
 
 PLAIN = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 BARREL = CameraModel(640, 480, 500.0, 505.0, 322.0, 236.0, (-0.35, 0.12, 0.001, -0.002, -0.02))
@@ -115,3 +116,74 @@ def test_field_of_view_of_each_model() -> None:
     assert ideal.horizontal_fov_rad == pytest.approx(640 / 200)
     assert not ideal.rectilinear
     assert PLAIN.rectilinear
+
+
+# Coefficients within which lenses are, and beyond: most of them fold the image somewhere.
+_RANGES: dict[DistortionModel, tuple[float, ...]] = {
+    "plumb_bob": (0.5, 0.4, 0.005, 0.005, 0.3),
+    "rational_polynomial": (1.0, 0.4, 0.005, 0.005, 0.1, 1.0, 0.4, 0.1),
+    "equidistant": (0.3, 0.3, 0.3, 0.3),
+}
+
+
+@st.composite
+def any_lens(draw: st.DrawFn) -> CameraModel:
+    kind = draw(st.sampled_from(DISTORTION_MODELS))
+    coefficients = tuple(draw(st.floats(-most, most)) for most in _RANGES[kind])
+    return CameraModel(640, 480, 300.0, 305.0, 322.0, 236.0, coefficients, kind)
+
+
+@given(camera=any_lens(), seed=st.integers(0, 1000))
+def test_a_ray_is_exact_or_missing_for_any_coefficients(camera: CameraModel, seed: int) -> None:
+    pixels = np.random.default_rng(seed).uniform((-0.5, -0.5), (639.5, 479.5), (50, 2))
+    rays = camera.rays(pixels)
+    seen = np.isfinite(rays).all(axis=1)
+    assert np.isnan(rays[~seen]).all()
+    assert np.abs(camera.project(rays[seen]) - pixels[seen]).max(initial=0.0) < 1e-5
+    # A direction further out is never seen nearer to the centre.
+    across = np.column_stack([np.sin(angles := np.linspace(0.0, 3.1, 400)), 0.0 * angles, np.cos(angles)])
+    columns = replace(camera, distortion=_untilted(camera)).project(across)[:, 0]
+    visible = np.isfinite(columns)
+    assert (np.diff(columns[visible]) >= -1e-9).all()
+    assert not visible[int(np.argmin(visible)) :].any() or visible.all()
+
+
+def _untilted(camera: CameraModel) -> tuple[float, ...]:
+    if camera.distortion_model == "equidistant":
+        return camera.distortion
+    return (*camera.distortion[:2], 0.0, 0.0, *camera.distortion[4:])
+
+
+FOLDED = {
+    "plumb_bob": replace(PLAIN, distortion=(-0.4, 0.0, 0.0, 0.0)),
+    "rising again": replace(PLAIN, distortion=(-0.5, 0.0, 0.0, 0.0, 0.06)),
+    "rational": replace(
+        PLAIN, distortion=(-0.4, 0.0, 0.0, 0.0, 0.0, 0.1, 0.0, 0.0), distortion_model="rational_polynomial"
+    ),
+    "equidistant": CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (0.1, -0.4, 0.0, 0.0), "equidistant"),
+}
+
+
+@pytest.mark.parametrize("camera", FOLDED.values(), ids=FOLDED)
+def test_fold_inside_the_image_is_named(camera: CameraModel) -> None:
+    sentence = pixels_without_rays(camera)
+    found = re.search(r"folds the image (\d+) px from its centre \((\d+) degrees", sentence)
+    assert found is not None
+    rim_px, angle_deg = map(int, found.groups())
+    columns = np.array([rim_px - 3, rim_px + 3]) + camera.cx
+    inside, outside = camera.rays(np.column_stack([columns, [camera.cy] * 2]))
+    assert math.degrees(math.atan2(inside[0], inside[2])) == pytest.approx(angle_deg, abs=7)
+    assert np.isnan(outside).all()
+    beyond = math.radians(angle_deg + 2)
+    assert np.isnan(camera.project(np.array([[math.sin(beyond), 0.0, math.cos(beyond)]]))).all()
+
+
+@pytest.mark.parametrize("camera", LENSES.values(), ids=LENSES)
+def test_lens_without_a_fold_has_no_sentence(camera: CameraModel) -> None:
+    assert pixels_without_rays(camera) == ""
+
+
+def test_circle_of_a_fisheye_beyond_90_degrees_is_no_fold() -> None:
+    circle = CameraModel(640, 480, 120.0, 120.0, 320.0, 240.0, (-0.06, 0.0, 0.0, 0.0), "equidistant")
+    assert np.isnan(circle.rays(np.array([[0.0, 0.0]]))).all()
+    assert pixels_without_rays(circle) == ""

@@ -89,7 +89,7 @@ def test_points_beyond_the_colour_lens_do_not_fold_into_image() -> None:
     wide = CameraModel.from_horizontal_fov(320, 240, 2.4)
     barrel = CameraModel(640, 480, 500.0, 500.0, 319.5, 239.5, (-0.3, 0.0, 0.0, 0.0, 0.0))
     beyond = wide.rays(np.array([[262.0, 119.5]]))
-    assert 320.0 < barrel.project(beyond)[0, 0] < 640.0  # what its polynomial gives
+    assert np.isnan(barrel.project(beyond)).all()  # its polynomial gives a pixel of the image
     depth = np.full((240, 320), 2.0, np.float32)
     depth[:, 240:] = 1.0
     found = DepthCalibration(wide, barrel, np.eye(3), np.zeros(3)).register(depth, 640, 480)

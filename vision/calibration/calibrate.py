@@ -9,7 +9,7 @@ import numpy as np
 
 from vision.calibration.boards import BoardView
 from vision.calibration.fit import Fit, fit, held_out_rms_px
-from vision.camera_model import EQUIDISTANT, PLUMB_BOB, CameraModel, DistortionModel
+from vision.camera_model import PLUMB_BOB, CameraModel, DistortionModel, pixels_without_rays
 
 LEAST_VIEWS = 6
 # A view whose error is larger than the median by this factor is an outlier; below this error none is.
@@ -89,7 +89,7 @@ def calibrate(views: Sequence[BoardView]) -> CalibrationResult:
 
 
 def _chosen(fits: dict[DistortionModel, Fit], held_out_px: dict[DistortionModel, float]) -> DistortionModel:
-    covering = [kind for kind, found in fits.items() if covers_image(found.model)]
+    covering = [kind for kind, found in fits.items() if not pixels_without_rays(found.model)]
     chosen, *others = covering or fits
     for kind in others:
         if held_out_px[kind] <= (BETTER if chosen == PLUMB_BOB else BETTER_OF_OTHERS) * held_out_px[chosen]:
@@ -120,15 +120,6 @@ def _fits(
     if not fits:
         raise CalibrationError("no lens fits the views: are the board's size and kind right?")
     return fits
-
-
-def covers_image(model: CameraModel) -> bool:
-    """Whether each pixel of the image has a ray; always true for a fisheye, whose image may be a circle."""
-    if model.distortion_model == EQUIDISTANT:
-        return True
-    x, y = (np.linspace(0, side - 1, 9) for side in (model.width, model.height))
-    edge = [(a, b) for a in x for b in (y[0], y[-1])] + [(a, b) for a in (x[0], x[-1]) for b in y]
-    return bool(np.isfinite(model.rays(np.array(edge))).all())
 
 
 def _held_out_px(found: Fit, views: Sequence[BoardView]) -> float:

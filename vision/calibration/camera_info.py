@@ -5,21 +5,25 @@ Those of other programs are read too, see `foreign_files`.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vision.calibration.lens_names import distortion_name
-from vision.camera_model import CameraModel
+from vision.camera_model import CameraModel, pixels_without_rays
 from vision.depth_registration import DepthCalibration
 from vision.file_kinds import explained
 from vision.home import expanded
 from vision.orientation import Orientation
 from vision.text_file import read_text
+
+logger = logging.getLogger(__name__)
 
 # The names that `companion calibrate` and ROS's camera_calibration write if none is given.
 _DEFAULT_NAMES = ("camera", "narrow_stereo")
@@ -146,6 +150,8 @@ def read_camera_info(path: Path) -> CameraInfo:
     try:
         content = load_calibration(read_text(path))
         model = _lens(content)
+        if problem := pixels_without_rays(model):
+            _warn(f"the calibration file {path}: {problem}")
         name = str(content.get("camera_name") or "")
         known = None if name in ("", *_DEFAULT_NAMES) else name
         return CameraInfo(path, model, known, _orientation(content), _registration(content, model))
@@ -154,6 +160,12 @@ def read_camera_info(path: Path) -> CameraInfo:
     except ValueError as error:  # UnicodeDecodeError and PlainYamlError are too
         problem = f"the calibration file {path} cannot be used: {error}"
         raise ValueError(explained(path, problem)) from None
+
+
+@lru_cache(maxsize=16)
+def _warn(text: str) -> None:
+    """Once: settings are read several times."""
+    logger.warning("%s", text)
 
 
 def _lens_lines(model: CameraModel, prefix: str = "") -> list[str]:

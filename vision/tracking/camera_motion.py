@@ -65,8 +65,9 @@ def rotate_boxes(states: BoxStates, camera: CameraModel, turn: Array) -> tuple[B
         return states, np.ones(0, np.bool_)
     rays = camera.rays(states.mean[:, :2])
     rotated = rays @ turn.T
-    ahead: NDArray[np.bool_] = rotated[:, 2] > MIN_COSINE
     moved = camera.project(rotated)
+    # NaN: the lens has no ray for the pixel, or does not see the direction any more.
+    ahead: NDArray[np.bool_] = (rotated[:, 2] > MIN_COSINE) & np.isfinite(moved).all(axis=1)
     # (N, 2, 2) derivative of the new pixel by the old one; lens distortion is neglected.
     focal = np.array([camera.fx, camera.fy])
     depth = np.where(ahead, rotated[:, 2], 1.0)[:, None, None]

@@ -54,6 +54,8 @@ def sees_ground(camera: CameraModel, pitch_rad: float) -> bool:
 
 @lru_cache(maxsize=8)
 def _lower_edge_rad(camera: CameraModel) -> float:
-    """Angle of the middle of the image's lower edge below the camera's axis."""
-    _, down, forward = camera.rays(np.array([[camera.cx, camera.height - 1]]))[0]
-    return math.atan2(down, forward)
+    """Angle of the lowest ray in the middle of the image below the camera's axis; -inf without any."""
+    rows = np.linspace(camera.height - 1, 0, 64)
+    rays = camera.rays(np.column_stack([np.full_like(rows, camera.cx), rows]))
+    # A lens may have no rays near the edge.
+    return next((math.atan2(down, forward) for _, down, forward in rays if math.isfinite(down)), -math.inf)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from companion.guidance.behaviour import BehaviourContext
@@ -60,3 +61,10 @@ def test_camera_sees_the_ground_unless_pitched_up(pitch_deg: float, seen: bool) 
     """80° across are 64° from top to bottom: the lower edge is 32° below the axis."""
     camera = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
     assert sees_ground(camera, math.radians(pitch_deg)) is seen
+
+
+def test_ground_is_seen_by_a_lens_that_folds_at_its_edge() -> None:
+    folded = CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.8, 0.0, 0.0, 0.0))
+    assert not np.isfinite(folded.rays(np.array([[320.0, 479.0]]))).any()
+    assert sees_ground(folded, math.radians(-20.0))
+    assert not sees_ground(folded, math.radians(60.0))

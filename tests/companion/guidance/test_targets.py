@@ -18,7 +18,7 @@ from companion.guidance.targets.from_detections import (
 from companion.guidance.targets.target import RangeSource
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import euler_from_quaternion, quaternion_from_euler, slerp, wrap_angle
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraModel, CameraMount, DistortionModel
 from vision.detections import DetectionRecord
 from vision.geolocation import range_from_known_height
 from vision.rotation import matrix_from_quaternion
@@ -474,3 +474,29 @@ def test_wide_object_in_a_rolled_image_is_ranged_correctly(roll_deg: float) -> N
     assert target.ground_range_m == pytest.approx(10.0 - CONTACT_INSET_M, abs=1.5)
     assert target.range_sigma_m > plain.range_sigma_m + 0.3
     assert abs(target.ground_range_m - (10.0 - CONTACT_INSET_M)) < 2 * target.range_sigma_m
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "model"),
+    [((-0.4, 0.0, 0.0, 0.0), "plumb_bob"), ((0.1, -0.4, 0.0, 0.0), "equidistant")],
+)
+def test_no_number_of_a_target_is_nan_where_a_lens_folds(
+    coefficients: tuple[float, ...], model: DistortionModel
+) -> None:
+    camera = CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, coefficients, model)
+    boxes = [(x, y, x + 80, y + 60) for x in range(0, 561, 40) for y in range(0, 421, 30)]
+    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    targets = targets_from_detections(
+        [detection(box) for box in boxes], T0, camera, MOUNT, history, {"car": 1.5}
+    )
+    assert 0 < len(targets) < len(boxes)
+    ranged = [target for target in targets if target.position_ned_m is not None]
+    assert ranged
+    for target in targets:
+        assert math.isfinite(target.bearing_rad)
+        assert math.isfinite(target.elevation_rad)
+        assert math.isfinite(target.ground_range_m) == (target.position_ned_m is not None)
+    for target in ranged:
+        assert target.position_ned_m is not None
+        numbers = (*target.position_ned_m, target.distance_m, target.range_sigma_m, target.across_sigma_m)
+        assert all(map(math.isfinite, numbers)), target

@@ -9,7 +9,7 @@ import pytest
 
 from mavlink_sim.datasets.board_views import LENSES, BoardPose, board_poses
 from vision.calibration.boards import Board, BoardView
-from vision.calibration.calibrate import CalibrationError, calibrate, covers_image
+from vision.calibration.calibrate import CalibrationError, calibrate
 from vision.calibration.fit import _Problem, fit
 from vision.camera_model import CameraModel
 
@@ -116,10 +116,3 @@ def test_first_poses_in_a_wrong_minimum_are_replaced() -> None:
     assert better is not None
     assert np.abs(better[0][3] - found.rotations[3]).max() < 0.1
     assert np.array_equal(better[0][4], found.rotations[4])
-
-
-def test_lens_that_folds_the_image_does_not_cover_it() -> None:
-    folded = CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (-0.5, 0.0, 0.0, 0.0))
-    assert not covers_image(folded)
-    assert covers_image(LENSES["webcam"])
-    assert covers_image(LENSES["fisheye"])

@@ -150,3 +150,17 @@ def test_missing_file_and_other_bytes_are_refused(tmp_path: Path) -> None:
     (file := tmp_path / "image.jpg").write_bytes(b"\xff\xd8\xff\xe0")
     with pytest.raises(ValueError, match=r"image\.jpg"):
         read_camera_info(file)
+
+
+def test_lens_that_folds_its_image_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folded = CameraModel(1920, 1080, 800.0, 800.0, 960.0, 540.0, (0.1, -0.2, 0.0, 0.0), "equidistant")
+    write_camera_info(file := tmp_path / "folded.yaml", folded, "camera")
+    write_camera_info(whole := tmp_path / "whole.yaml", CameraModel(640, 480, 500, 500, 320, 240), "camera")
+    (ros := tmp_path / "ost.yaml").write_text(ROS)
+    for each in (file, file, whole, ros):
+        read_camera_info(each)
+    (record,) = caplog.records
+    assert record.levelname == "WARNING"
+    assert f"{file}: " in record.getMessage()
+    assert "730 px" in record.getMessage()
+    assert "1101 px" in record.getMessage()

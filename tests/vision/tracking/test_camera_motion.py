@@ -159,3 +159,21 @@ def test_late_samples_are_ignored_and_old_ones_dropped() -> None:
     np.testing.assert_allclose(attitude, matrix_from_euler(0, 0, 0.15), atol=1e-6)
     history.add(round((HISTORY_S + 0.15) * 1e9), quaternion_from_euler(0, 0, 0.2))
     assert history.at(120 * MS) is None
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [
+        replace(CAMERA, distortion=(-0.4, 0.0, 0.0, 0.0)),
+        CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (0.1, -0.4, 0.0, 0.0), "equidistant"),
+    ],
+    ids=["plumb_bob", "equidistant"],
+)
+def test_state_stays_finite_where_a_lens_folds(camera: CameraModel) -> None:
+    boxes = np.concatenate([at(x, y) for x in range(10, 640, 30) for y in range(10, 480, 30)])
+    for turn in np.linspace(-0.6, 0.6, 7):
+        moved, visible = rotate_boxes(initiate(boxes), camera, matrix_from_euler(0.0, turn, 0.0))
+        assert np.isfinite(moved.mean).all()
+        assert np.isfinite(moved.covariance).all()
+        assert visible.any()
+        assert not visible.all()
