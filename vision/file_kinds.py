@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import BinaryIO
 
 _HEAD_BYTES = 65_536
+_INDEX_BYTES = 64 << 20
+_MP4, _MATROSKA = "is a video (MP4)", "is a video (Matroska, WebM)"
 _HEIC = "is a HEIC image, as iPhones take: convert it to JPEG"
 _MAGIC: tuple[tuple[bytes, int, str], ...] = (
     (b"\xff\xd8\xff", 0, "is a JPEG image"),
@@ -21,8 +24,12 @@ _MAGIC: tuple[tuple[bytes, int, str], ...] = (
     *((b"ftyp" + brand, 4, _HEIC) for brand in (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")),
     *((b"ftyp" + brand, 4, "is an AVIF image") for brand in (b"avif", b"avis")),
     (b"AVI ", 8, "is a video (AVI)"),
-    (b"ftyp", 4, "is a video (MP4)"),
-    (b"\x1aE\xdf\xa3", 0, "is a video (Matroska, WebM)"),
+    (b"WAVE", 8, "is a sound recording (WAV)"),
+    (b"ftypM4A ", 4, "is a sound recording (MP4)"),
+    (b"fLaC", 0, "is a sound recording (FLAC)"),
+    (b"ID3", 0, "is a sound recording (MP3)"),
+    (b"ftyp", 4, _MP4),
+    (b"\x1aE\xdf\xa3", 0, _MATROSKA),
     (b"\x89MCAP0\r\n", 0, "is a recording (MCAP): `companion log show` shows it"),
     (b"ULog\x01\x12\x35", 0, "is a log of PX4 (ULog): `companion log ulog` adds it to a recording"),
     (b"\xa3\x95\x80", 0, "is a log of ArduPilot (dataflash): read it with a ground station"),
@@ -124,24 +131,50 @@ def kind_of_text(text: str) -> str | None:
     return kind_of_bytes(text[:_HEAD_BYTES].encode())
 
 
-def has_no_index(path: Path) -> bool:
-    """Whether an MP4 file lacks its index (`moov`, ISO 14496-12), which is written when a recording ends."""
+def why_no_frames(path: Path) -> str:
+    """Why a video file has none, as a sentence without its name; empty: its container does not say.
+
+    By an MP4 file's index (`moov`, ISO 14496-12), which is written when a recording ends, and the names of
+    the tracks' codecs near the beginning of a Matroska file.
+    """
     with path.open("rb") as file:
-        if kind_of_bytes(file.read(16)) != "is a video (MP4)":
-            return False
-        at, size = 0, path.stat().st_size
-        while at + 8 <= size:
+        head = file.read(_HEAD_BYTES)
+        kind = kind_of_bytes(head)
+        if kind == _MP4:
+            index = _mp4_index(file, path.stat().st_size)
+            if index is None:
+                return (
+                    "is an MP4 video without its index (moov): its recording or copy was not ended; copy it "
+                    "again, or repair it with untrunc"
+                )
+            images, sound = b"vide" in index, b"soun" in index
+        elif kind == _MATROSKA:
+            images, sound = (re.search(rb"\x86[\x82-\xbf]" + of, head) is not None for of in (b"V_", b"A_"))
+        else:
+            return ""
+    if images:
+        return ""
+    return (
+        "has sound but no images" if sound else "is a video without frames: its recording was ended too early"
+    )
+
+
+def _mp4_index(file: BinaryIO, size: int) -> bytes | None:
+    """The content of the index; None if there is none."""
+    at = 0
+    while at + 8 <= size:
+        file.seek(at)
+        header = file.read(16)
+        length, kind = int.from_bytes(header[:4], "big"), header[4:8]
+        if kind == b"moov":
             file.seek(at)
-            header = file.read(16)
-            length, kind = int.from_bytes(header[:4], "big"), header[4:8]
-            if kind == b"moov":
-                return False
-            if length == 1:
-                length = int.from_bytes(header[8:16], "big")
-            if length < 8:  # 0: to the end of the file
-                return True
-            at += length
-    return True
+            return file.read(min(length or size, _INDEX_BYTES))
+        if length == 1:
+            length = int.from_bytes(header[8:16], "big")
+        if length < 8:  # 0: to the end of the file
+            return None
+        at += length
+    return None
 
 
 def _zip_kind(head: bytes) -> str:

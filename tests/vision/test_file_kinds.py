@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vision.file_kinds import explained, has_no_index, wrong_file
+from vision.file_kinds import explained, why_no_frames, wrong_file
 
 _FTYP = b"\0\0\0\x10ftypisom\0\0\2\0"
 # First bytes → a word of the sentence.
@@ -25,6 +25,10 @@ KINDS = {
     b"\xff\xd8\xff\xe0": "JPEG",
     b"\x89PNG\r\n\x1a\n": "PNG",
     _FTYP: "MP4",
+    b"\0\0\0\x18ftypheic": "HEIC",
+    b"\0\0\0\x18ftypavif": "AVIF",
+    b"\0\0\0\x18ftypM4A ": "sound",
+    b"RIFF\0\0\0\0WAVEfmt ": "WAV",
     b"\x1aE\xdf\xa3": "Matroska",
     b"\x89MCAP0\r\n": "MCAP",
     b"ULog\x01\x12\x35": "ULog",
@@ -73,13 +77,26 @@ def test_zip_is_named_by_its_members(member: str, word: str, tmp_path: Path) -> 
     assert (wrong_file(tmp_path / "a.pt", "is a checkpoint of torch") is None) == (word == "torch")
 
 
-def test_video_without_index_is_known(tmp_path: Path) -> None:
-    path = tmp_path / "a.mp4"
-    mdat, moov = b"\0\0\0\x10mdat" + bytes(8), b"\0\0\0\x08moov"
-    for content, missing in (
-        (_FTYP + mdat, True),
-        (_FTYP + mdat + moov, False),
-        (_FTYP + moov + mdat, False),
-    ):
-        path.write_bytes(content)
-        assert has_no_index(path) is missing
+_MDAT, _VIDEO, _SOUND = b"\0\0\0\x10mdat" + bytes(8), b"\0\0\0\x0cmoovvide", b"\0\0\0\x0cmoovsoun"
+_MATROSKA = b"\x1aE\xdf\xa3"
+# The file → a word of the reason.
+NO_FRAMES = {
+    "MP4 without index": (_FTYP + _MDAT, "moov"),
+    "MP4 cut in its first box": (_FTYP[:12], "moov"),
+    "MP4 of sound": (_FTYP + _SOUND + _MDAT, "sound"),
+    "MP4 of nothing": (_FTYP + _MDAT + b"\0\0\0\x08moov", "without frames"),
+    "MP4": (_FTYP + _MDAT + _VIDEO, ""),
+    "MP4, index first": (_FTYP + _VIDEO + _MDAT, ""),
+    "Matroska of sound": (_MATROSKA + b"\x86\x85A_AAC", "sound"),
+    "Matroska of nothing": (_MATROSKA + bytes(40), "without frames"),
+    "Matroska": (_MATROSKA + b"\x86\x85V_VP9\x86\x85A_AAC", ""),
+    "another kind": (b"x" * 40, ""),
+}
+
+
+@pytest.mark.parametrize("name", NO_FRAMES)
+def test_reason_why_a_video_has_no_frames(name: str, tmp_path: Path) -> None:
+    content, word = NO_FRAMES[name]
+    (path := tmp_path / "a.mp4").write_bytes(content)
+    assert word in why_no_frames(path)
+    assert bool(word) == bool(why_no_frames(path))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.file_kinds import explained, has_no_index
+from vision.file_kinds import explained, why_no_frames
 from vision.image_file import IMAGE_SUFFIXES, ImageError, is_hidden, natural_key, read_image
 from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
@@ -133,11 +133,8 @@ class VideoFileCapture(Capture):
         self._path = path
         self._capture = open_ffmpeg(str(path))
         if not self._capture.isOpened():
-            if has_no_index(path):
-                raise SourceError(
-                    f"{path}: is an MP4 video without its index (moov): its recording or copy was not ended; "
-                    f"copy it again, or repair it with untrunc"
-                )
+            if reason := why_no_frames(path):
+                raise SourceError(f"{path}: {reason}")
             problem = (
                 f"{path}: no video that FFmpeg can read ({path.stat().st_size} bytes); it may be damaged or "
                 f"another kind of file"
