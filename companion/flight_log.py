@@ -20,6 +20,7 @@ from companion.recording.convert import (
     ULOG_NAME,
 )
 from companion.recording.files import RecordingReader
+from vision.file_kinds import is_hidden
 
 _LARGE = {topic.name: topic.name.replace("_", " ") + "s" for topic in LARGE_TOPICS}
 _READ = (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL, LOG_CHANNEL)
@@ -153,7 +154,7 @@ def summaries(directory: Path) -> Iterator[RecordingSummary | RecordingError]:
         RecordingError: the folder cannot be read.
     """
     try:
-        paths = sorted(path for path in directory.iterdir() if path.suffix == ".mcap")
+        paths = sorted(path for path in directory.iterdir() if path.suffix == ".mcap" and not is_hidden(path))
     except OSError as error:
         raise RecordingError(f"{directory}: cannot be read: {error.strerror}") from error
     for path in paths:

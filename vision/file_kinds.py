@@ -85,6 +85,11 @@ _TEXTS: tuple[tuple[re.Pattern[bytes], str], ...] = tuple(
 )
 
 
+def is_hidden(path: Path) -> bool:
+    """Whether the name begins with a dot, as those that macOS adds (`._NAME`)."""
+    return path.name.startswith(".")
+
+
 def wrong_file(path: Path, *fitting: str) -> str | None:
     """What a file is, if it is of a kind that is recognised, after its name: `given.pt: is an HTML page …`.
 

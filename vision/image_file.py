@@ -61,13 +61,8 @@ class DecodedImage:
 
 
 def is_image(path: Path) -> bool:
-    """Whether the file name has an image suffix, and is not hidden."""
-    return path.suffix.lower() in IMAGE_SUFFIXES and not is_hidden(path)
-
-
-def is_hidden(path: Path) -> bool:
-    """Whether the name begins with a dot, as those that macOS adds (`._NAME`)."""
-    return path.name.startswith(".")
+    """Whether the file name has an image suffix."""
+    return path.suffix.lower() in IMAGE_SUFFIXES
 
 
 def natural_key(path: Path) -> tuple[tuple[int, int, str], ...]:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from vision.catalog import KNOWN
+from vision.file_kinds import is_hidden
 from vision.home import expanded, home_folder
 
 # Suffixes of model files, in the order in which a bare name is looked up.
@@ -46,7 +47,7 @@ def kept_models(*folders: Path) -> list[Path]:
     for folder in folders or models_folders():
         with suppress(OSError):  # no such folder, or not for us
             for path in folder.iterdir():
-                if path.suffix in MODEL_SUFFIXES and path.is_file():
+                if path.suffix in MODEL_SUFFIXES and not is_hidden(path) and path.is_file():
                     found.setdefault(path.name, path)
     return [found[name] for name in sorted(found)]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from vision.evaluation.datasets import DatasetError, image_files
 from vision.evaluation.datasets import read_image as read_labelled
-from vision.image_file import ImageError, decode, decode_image, is_image, read_image
+from vision.image_file import ImageError, decode, decode_image, read_image
 from vision.runtimes.quantize import FEWEST_IMAGES, calibration_images
 from vision.sources import SourceError, open_source
 
@@ -203,7 +203,8 @@ def test_hidden_files_are_no_images(tmp_path: Path) -> None:
         assert [frame.file_name for frame in source] == ["a.png", "c.PNG"]
     found = [str(path.relative_to(tmp_path)) for path in image_files(tmp_path)]
     assert found == ["a.png", "c.PNG", "more/e.jpg"]
-    assert not is_image(Path("._a.png"))
+    with open_source(str(tmp_path / ".b.png")) as source:  # given by name
+        assert [frame.file_name for frame in source] == [".b.png"]
 
 
 def test_folder_names_a_heic_image_beside_others(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision import image_file
-from vision.file_kinds import explained
-from vision.image_file import is_hidden, is_image
+from vision.file_kinds import explained, is_hidden
+from vision.image_file import is_image
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
 
@@ -152,7 +152,8 @@ def image_files(folder: Path) -> list[Path]:
 def _images_below(folder: Path) -> Iterator[Path]:
     for where, folders, names in os.walk(folder):
         folders[:] = sorted(name for name in folders if not is_hidden(Path(name)))
-        yield from (Path(where, name) for name in names if is_image(Path(name)))
+        files = (Path(where, name) for name in names)
+        yield from (path for path in files if is_image(path) and not is_hidden(path))
 
 
 def read_image(path: Path) -> NDArray[np.uint8]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from vision.extras import install_command
-from vision.file_kinds import explained, wrong_file
+from vision.file_kinds import explained, is_hidden, wrong_file
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.model_files import missing_model_advice
 from vision.runtimes.base import (
@@ -206,7 +206,8 @@ def _facts(path: Path, kind: ExportKind) -> ExportedFacts | ForeignFacts:
 def _file_in(folder: Path) -> Path:
     """The `.xml` in a folder of OpenVINO files."""
     try:
-        found = sorted(path for path in folder.iterdir() if path.suffix == SUFFIXES["openvino"])
+        files = (path for path in folder.iterdir() if not is_hidden(path))
+        found = sorted(path for path in files if path.suffix == SUFFIXES["openvino"])
     except OSError as error:
         raise CheckpointError(f"{folder}: cannot be read ({error.strerror or error})") from None
     if len(found) != 1:

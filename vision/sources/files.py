@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.file_kinds import explained, why_no_frames
-from vision.image_file import IMAGE_SUFFIXES, ImageError, is_hidden, natural_key, read_image
+from vision.file_kinds import explained, is_hidden, why_no_frames
+from vision.image_file import IMAGE_SUFFIXES, ImageError, natural_key, read_image
 from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
