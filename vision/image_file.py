@@ -84,14 +84,29 @@ def read_image(path: Path) -> NDArray[np.uint8]:
     except OSError as error:
         raise ImageError(f"cannot be read: {error.strerror or error}") from None
     image = decode(data)
-    if image.note and (noted := (path.absolute().parent, re.sub(r"\d+", "", image.note))) not in _noted:
-        _noted.add(noted)
-        logger.warning("%s: %s; said once a folder", path, image.note)
+    _log_once(str(path), image.note, str(path.absolute().parent))
     return image.pixels
 
 
-_noted: set[tuple[Path, str]] = set()
-"""Folders, with the notes that were logged for them, without their numbers."""
+def frame_pixels(image: NDArray[Any], name: str) -> NDArray[np.uint8]:
+    """(height, width, 3) uint8 BGR of a frame of a video or camera, whose note is logged once.
+
+    Args:
+        image: (height, width, 3) uint8, BGR; or (height, width) uint16. name: of the video or camera.
+    """
+    pixels, note = _eight_bits(image)
+    _log_once(name, note, name)
+    return pixels
+
+
+_noted: set[tuple[str, str]] = set()
+"""Folders, videos and cameras, with the notes that were logged for them, without their numbers."""
+
+
+def _log_once(name: str, note: str, place: str) -> None:
+    if note and (noted := (place, re.sub(r"\d+", "", note))) not in _noted:
+        _noted.add(noted)
+        logger.warning("%s: %s; said once", name, note)
 
 
 def decode_image(data: bytes) -> NDArray[np.uint8] | None:
@@ -120,16 +135,13 @@ def decode(data: bytes) -> DecodedImage:
         image = _decoded(whole)
     if image is None or image.itemsize > 2:
         raise ImageError(_unreadable(data, image))
-    if image.ndim == 2:
-        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
-    if image.dtype != np.uint8:
-        image, note = _eight_bits(image)
-        notes += [note] * bool(note)
+    pixels, note = _eight_bits(image)
+    notes += [note] * bool(note)
     if data.startswith(b"RIFF") and data[12:16] == b"VP8X" and data[20] & 2:
         notes.append("is an animation: its first image is read")
     elif (order := _TIFF.get(data[:4])) and (pages := _pages(data, order)) > 1:
         notes.append(f"has {pages} pages: its first one is read")
-    return DecodedImage(np.ascontiguousarray(image, dtype=np.uint8), "; ".join(notes))
+    return DecodedImage(pixels, "; ".join(notes))
 
 
 def _decoded(data: bytes) -> NDArray[Any] | None:
@@ -204,13 +216,23 @@ def _unreadable(data: bytes, image: NDArray[Any] | None) -> str:
 
 
 def _eight_bits(image: NDArray[Any]) -> tuple[NDArray[np.uint8], str]:
-    """16-bit integers, signed or not, as 8 bits, with a note if they were stretched."""
+    """Grey or colour of 8 or 16 bits, signed or not, as 8-bit BGR; with a note if it was stretched."""
+    note = ""
+    if image.dtype != np.uint8:
+        image, note = _upper_byte_or_stretched(image)
+    if image.ndim == 2:
+        image = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    return np.ascontiguousarray(image, dtype=np.uint8), note
+
+
+def _upper_byte_or_stretched(image: NDArray[Any]) -> tuple[NDArray[np.uint8], str]:
     offset = 0
     if image.dtype.kind == "i":  # two's complement → the same order, unsigned
         image, offset = image.view(np.uint16) ^ np.uint16(0x8000), 0x8000
     step = int(np.ceil(np.sqrt(image.size / _MOST_SAMPLES)))
-    share = (_IGNORED_PERCENT, 100.0 - _IGNORED_PERCENT)
-    low, high = np.percentile(image[::step, ::step], share).round().astype(int).tolist()
+    reached = np.cumsum(np.bincount(image[::step, ::step].ravel(), minlength=1 << 16))
+    share = np.array([_IGNORED_PERCENT, 100.0 - _IGNORED_PERCENT]) / 100.0
+    low, high = np.searchsorted(reached, share * (reached[-1] - 1), side="right").tolist()
     if not 0 < high - low < _STRETCHED_BELOW:
         return (image >> 8).astype(np.uint8), ""
     table = np.clip((np.arange(1 << 16) - low) * (255.0 / (high - low)), 0.0, 255.0)

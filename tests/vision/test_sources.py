@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
 import time
 import zlib
 from pathlib import Path
 
 import cv2
+import imageio_ffmpeg  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 
@@ -138,6 +140,20 @@ def test_a_folder_gives_its_images_in_natural_order_of_any_size(tmp_path: Path) 
         frames = list(source)
     assert [int(frame.image[0, 0, 0]) for frame in frames] == [20, 40, 200]
     assert [frame.width for frame in frames] == [17, 18, 26]
+
+
+def test_video_of_16_bit_grey_is_stretched(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path, counts = tmp_path / "thermal.mkv", np.tile(np.arange(7000, 7064, dtype="<u2"), (48, 1))
+    raw = ("-loglevel", "error", "-f", "rawvideo", "-pix_fmt", "gray16le", "-s", "64x48", "-i", "-")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *raw, "-c:v", "ffv1", str(path)]
+    subprocess.run(command, input=counts.tobytes() * 3, check=True)
+    with open_source(str(path)) as source:
+        frames = list(source)
+    assert len(frames) == 3
+    for frame in frames:
+        assert frame.image.shape == (48, 64, 3)
+        assert (frame.image[0, 0, 0], frame.image[0, 63, 2]) == (0, 255)
+    assert caplog.text.count("values 7000 to 7063") == 1
 
 
 def test_image_that_cannot_be_shown_names_why(tmp_path: Path) -> None:

@@ -59,6 +59,8 @@ class FakeCamera:
         return self is not FakeCamera.opened[0] or self.reads <= self.frames_before_unplugged
 
     def retrieve(self) -> tuple[bool, Any]:
+        if (cv2.CAP_PROP_CONVERT_RGB, 0) in self.asked:
+            return True, np.tile(np.arange(7000, 7640, dtype=np.uint16), (480, 1))
         return True, np.full((480, 640, 3), 50, np.uint8)
 
     def release(self) -> None:
@@ -95,6 +97,16 @@ def test_settings_reach_the_driver_pixel_format_first(device: Path, caplog: pyte
     ]
     assert "640x480 MJPG at 30 Hz" in caplog.text
     assert camera.released
+
+
+def test_counts_of_16_bits_are_stretched(device: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with open_source("0", SourceSettings(pixel_format="Y16 ")) as source:
+        for _ in range(2):
+            frame = source.read(20.0)
+            assert frame is not None
+            assert frame.image.shape == (480, 640, 3)
+            assert (frame.image.min(), frame.image.max()) == (0, 255)
+    assert caplog.text.count("values 7000 to 7639") == 1
 
 
 def test_settings_not_accepted_by_the_driver_are_logged(

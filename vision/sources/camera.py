@@ -24,6 +24,7 @@ from vision.sources.v4l2 import ControlError, fourcc_text, holders, set_exposure
 
 logger = logging.getLogger(__name__)
 
+_GREY_16 = "Y16 "  # V4L2's format of a thermal camera's counts
 _OLDEST_STAMP_NS = 1_000_000_000  # an older driver stamp is from another clock
 
 
@@ -107,6 +108,8 @@ class CameraCapture(Capture):
         height = round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         rate_hz = capture.get(cv2.CAP_PROP_FPS)
         pixel_format = fourcc_text(int(capture.get(cv2.CAP_PROP_FOURCC)))
+        if pixel_format == _GREY_16:  # else OpenCV delivers the upper byte
+            capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         refused = [
             f"{name} {requested}"
             for name, requested, actual in (
@@ -125,7 +128,7 @@ class CameraCapture(Capture):
             logger.info("%s: set to %s", self._device, actual_text)
 
     def read(self, timeout_s: float) -> RawFrame | None:
-        image, now_ns, decode_ms = read_capture(self._capture)
+        image, now_ns, decode_ms = read_capture(self._capture, str(self._device))
         if image is None:
             raise CaptureError(f"the camera delivered no frame{_why_silent(self._device)}")
         driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)

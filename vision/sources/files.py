@@ -9,17 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 from numpy.typing import NDArray
 
 from vision.file_kinds import explained, is_hidden, why_no_frames
-from vision.image_file import IMAGE_SUFFIXES, ImageError, natural_key, read_image
+from vision.image_file import IMAGE_SUFFIXES, ImageError, frame_pixels, natural_key, read_image
 from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
 
 logger = logging.getLogger(__name__)
 
+# FFmpeg's gray16le, of which OpenCV would deliver the upper byte.
+_GREY_16 = int.from_bytes(b"Y1\0\x10", "little")
 _CAP_PROP_PTS = 71  # stamp in frame intervals; its name is missing before OpenCV 4.11, where it is 0
 
 
@@ -140,6 +141,8 @@ class VideoFileCapture(Capture):
                 f"another kind of file"
             )
             raise SourceError(explained(path, problem, "is a video"))
+        if self._capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == _GREY_16:
+            self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
         self.interval_s = interval_of(self._capture)
         self._grabbed = self._capture.grab()
         self._claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -155,7 +158,7 @@ class VideoFileCapture(Capture):
         ok, image = self._capture.retrieve() if self._grabbed or self._capture.grab() else (False, None)
         self._grabbed = False
         decode_ms = (time.monotonic_ns() - started_ns) / 1e6  # a file read does not wait
-        if not ok:
+        if not ok or image is None:
             missing = self._missing()
             if missing > max(2, 0.02 * (self._delivered + missing)):
                 expected = self._delivered + missing
@@ -164,7 +167,7 @@ class VideoFileCapture(Capture):
         self._delivered += 1
         stamp_s = self._stamp_s()
         self._latest_s = max(self._latest_s, self._start_s + stamp_s)
-        pixels = np.ascontiguousarray(image, dtype=np.uint8)
+        pixels = frame_pixels(image, str(self._path))
         return RawFrame(pixels, media_s=stamp_s, decode_ms=decode_ms, file_name=self._path.name)
 
     def _stamp_s(self) -> float:

@@ -109,7 +109,7 @@ class StreamCapture(Capture):
         self.interval_s = interval_of(self._capture)
 
     def read(self, timeout_s: float) -> RawFrame | None:
-        image, captured_ns, decode_ms = read_capture(self._capture)
+        image, captured_ns, decode_ms = read_capture(self._capture, "the stream")
         if image is None:
             # OpenCV does not distinguish the end of a stream from a timeout of `read_timeout_s`.
             raise CaptureError("the stream stopped")

@@ -16,6 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.image_file import frame_pixels
+
 _AV_LOG_QUIET = "-8"  # libavutil/log.h
 _environment_lock = threading.Lock()
 
@@ -45,10 +47,13 @@ def environment(name: str, value: str) -> Iterator[None]:
                 os.environ[name] = before
 
 
-def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, int, float]:
+def read_capture(capture: cv2.VideoCapture, name: str) -> tuple[NDArray[np.uint8] | None, int, float]:
     """Read the next image of a capture, with its arrival time and decoding time.
 
     OpenCV waits and decodes in two calls; FFmpeg's decoders already work in the first.
+
+    Args:
+        name: of the capture, for a line about its pixels.
 
     Returns:
         (height, width, 3) uint8 BGR or None; CLOCK_MONOTONIC nanoseconds of the first call's end;
@@ -61,7 +66,7 @@ def read_capture(capture: cv2.VideoCapture) -> tuple[NDArray[np.uint8] | None, i
     decode_ms = (time.monotonic_ns() - arrived_ns) / 1e6
     if not ok or image is None:
         return None, arrived_ns, decode_ms
-    return np.ascontiguousarray(image, dtype=np.uint8), arrived_ns, decode_ms
+    return frame_pixels(image, name), arrived_ns, decode_ms
 
 
 def interval_of(capture: cv2.VideoCapture) -> float:
