@@ -9,6 +9,7 @@ import re
 import socket
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,7 @@ from typer.testing import CliRunner, Result
 import vision.sources
 from companion import calibrate as calibrate_module
 from companion.bus.config import zenoh_config
-from companion.calibrate import LiveTilt, collect_views, markers_of
+from companion.calibrate import LiveTilt, collect_views, markers_of, result_lines
 from companion.cli.commands import app
 from companion.settings.bus import ZenohSection
 from mavlink_sim.camera.image_effects import ImageEffects
@@ -40,12 +41,13 @@ from mavlink_sim.world.world import Ground, World, WorldObject
 from vision.attitude import quaternion_from_euler
 from vision.calibration.boards import Board
 from vision.calibration.calibrate import CalibrationError
+from vision.calibration.calibrate import calibrate as calibrate_views
 from vision.calibration.camera_info import camera_identity, read_camera_info, write_camera_info
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame
 from vision.markers import MarkerKind
 from vision.rotation import matrix_from_euler
-from vision.sources import Source, SourceError, SourceStatistics
+from vision.sources import Source, SourceError, SourceStatistics, open_source
 
 # A small lens and board, so that views are rendered and found fast.
 LENS = LENSES["webcam"].scaled(320, 240)
@@ -101,6 +103,16 @@ def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -
     done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
     assert done.exit_code == 0, done.output
     assert f"fx_px = {lens.fx}" in done.stdout
+
+
+def test_result_names_where_the_lens_folds_the_image(few: Path) -> None:
+    with open_source(str(few)) as source:
+        found = calibrate_views(collect_views(source, BOARD, lambda _: None).collector.chosen())
+    folded = CameraModel(320, 240, 150.0, 150.0, 160.0, 120.0, (-0.4, 0.0, 0.0, 0.0))
+    whole = CameraModel(320, 240, 250.0, 250.0, 160.0, 120.0, (-0.1, 0.0, 0.0, 0.0))
+    counts = [len(result_lines(replace(found, model=model))) for model in (whole, folded)]
+    assert counts[1] == counts[0] + 1
+    assert "folds the image" in result_lines(replace(found, model=folded))[-1]
 
 
 def test_video_gives_a_calibration(tmp_path: Path) -> None:
