@@ -21,13 +21,11 @@ from vision.file_kinds import kind_of_bytes
 
 logger = logging.getLogger(__name__)
 
-IMAGE_SUFFIXES = frozenset(
-    (
-        *(".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif"),
-        *(".heic", ".heif"),
-    )
+UNREADABLE_SUFFIXES = frozenset((".heic", ".heif"))
+"""Images that are not read, but are named where they are found."""
+IMAGE_SUFFIXES = UNREADABLE_SUFFIXES.union(
+    (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm", ".pnm", ".jp2", ".avif")
 )
-"""HEIC is not read, but is named where it is found."""
 
 # Of these the decoder knows more than the kind of file.
 _AVIF = "is an AVIF image"

@@ -12,7 +12,14 @@ import cv2
 from numpy.typing import NDArray
 
 from vision.file_kinds import explained, is_hidden, why_no_frames
-from vision.image_file import IMAGE_SUFFIXES, ImageError, frame_pixels, natural_key, read_image
+from vision.image_file import (
+    IMAGE_SUFFIXES,
+    UNREADABLE_SUFFIXES,
+    ImageError,
+    frame_pixels,
+    natural_key,
+    read_image,
+)
 from vision.sources.capture import LONGEST_STEP_S, Capture, RawFrame
 from vision.sources.opencv import interval_of, open_ffmpeg, quiet_opencv
 from vision.sources.source import EndOfStream, SourceError
@@ -39,9 +46,8 @@ def images_in(folder: Path, suffixes: frozenset[str] = IMAGE_SUFFIXES) -> list[P
         key=natural_key,
     )
     if not paths:
-        raise SourceError(
-            f"{folder}: no images in this folder; expected names ending in {', '.join(sorted(suffixes))}"
-        )
+        known = ", ".join(sorted(suffixes - UNREADABLE_SUFFIXES))
+        raise SourceError(f"{folder}: no images in this folder; expected names ending in {known}")
     return paths
 
 
