@@ -15,29 +15,39 @@ from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
-from companion.restarts import Restarts
+from companion.passing import EXIT_PASSING
+from companion.restarts import LATER_S, Restarts
 from companion.scheduling import schedule_as_any_program
-from companion.tasks import spawn
+from companion.tasks import error_text, spawn
 
-# Exit code of a program that has printed in one line why it cannot work: it is not started again.
+# Exit code of a program that has printed in one line why it cannot work: it is not started again. With
+# EXIT_PASSING it is, later.
 EXIT_REFUSED = 2
 _END_S = 5.0
 _UNSAID_S = 2.0  # a longer end is announced
 
 Say = Callable[[str], None]
+OnEnd = Callable[[str, bool], None]
 
 
 @asynccontextmanager
 async def child_process(
-    name: str, module: str, argument: str, say: Say, *, end_s: float = _END_S
+    name: str,
+    module: str,
+    argument: str,
+    say: Say,
+    *,
+    on_end: OnEnd = lambda _why, _again: None,
+    end_s: float = _END_S,
 ) -> AsyncIterator[None]:
     """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash (`Restarts`).
 
     Args:
-        name: for people. say: called in the loop with each line that it prints, and with its end.
+        name: for people. say: called in the loop with each new line that it prints, and with its end.
+        on_end: called with why it has ended by itself, and whether it is started again.
         end_s: it is killed if it takes longer to end, seconds.
     """
-    running = spawn(_supervise(name, (module, argument), say, end_s), name)
+    running = spawn(_supervise(name, (module, argument), say, on_end, end_s), name)
     try:
         yield
     finally:
@@ -45,24 +55,38 @@ async def child_process(
         await asyncio.gather(running, return_exceptions=True)
 
 
-async def _supervise(name: str, words: tuple[str, str], say: Say, end_s: float) -> None:
+async def _supervise(name: str, words: tuple[str, str], say: Say, on_end: OnEnd, end_s: float) -> None:
     restarts = Restarts()
+    last = ""
+
+    def say_new(text: str) -> None:
+        nonlocal last
+        if text != last:  # why it cannot work now is the same at every try
+            say(f"{name}: {text}")
+        last = text
+
     while True:
         started_s = time.monotonic()
         try:
-            code = await _run_once(name, words, say, end_s)
-        except (OSError, ValueError) as error:  # no process, or a line above 64 KiB
-            why = str(error)
+            code = await _run_once(words, say_new, end_s)
+        except Exception as error:  # no process, a line above 64 KiB, or a fault of ours
+            why = error_text(error)
         else:
-            if code == EXIT_REFUSED:
-                return
+            if code in (EXIT_REFUSED, EXIT_PASSING):
+                on_end(last, code == EXIT_PASSING)
+                if code == EXIT_REFUSED:
+                    return
+                await asyncio.sleep(LATER_S)
+                continue
             why = f"its process ended with code {code}"
-        restart = restarts.after(time.monotonic() - started_s)
-        say(f"{name}: {why}; {restart}")
+        on_end(why, True)
+        restart = restarts.after(time.monotonic() - started_s, why)
+        if restart.reported:
+            say_new(f"{why}; {restart}")
         await asyncio.sleep(restart.pause_s)
 
 
-async def _run_once(name: str, words: tuple[str, str], say: Say, end_s: float) -> int:
+async def _run_once(words: tuple[str, str], say: Say, end_s: float) -> int:
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",  # import from the search path below, not from the working directory
@@ -79,10 +103,10 @@ async def _run_once(name: str, words: tuple[str, str], say: Say, end_s: float) -
     try:
         assert process.stdout is not None
         while line := await process.stdout.readline():
-            say(f"{name}: {line.decode(errors='replace').rstrip()}")
+            say(line.decode(errors="replace").rstrip())
         return await process.wait()
     finally:
-        await _end(process, end_s, lambda text: say(f"{name}: {text}"))
+        await _end(process, end_s, say)
 
 
 async def _end(process: Process, end_s: float, say: Say) -> None:

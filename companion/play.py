@@ -10,6 +10,7 @@ from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from typing import Any
 
+from companion.bus.config import EndpointTakenError
 from companion.dashboard.process import dashboard_process
 from companion.guidance import grammar
 from companion.language.process import AskProcess
@@ -78,7 +79,8 @@ def play(settings: Settings, options: PlayOptions, say: Say) -> None:
     """Start everything, print example commands, and take commands until a signal or `quit` ends it.
 
     Raises:
-        SimSessionError: it cannot start, for example for an unknown scene.
+        SimSessionError: it cannot start, for example for an unknown scene. EndpointTakenError: another
+            program has the port of zenoh.
         SimulationLostError: the simulator ended in operation.
         LinkError, PerceptionStartError, BusError: as `Service.run`.
     """
@@ -102,7 +104,7 @@ def _check_zenoh_ports(settings: Settings) -> None:
             try:
                 probe.bind((host.strip("[]"), int(port)))
             except OSError as error:
-                raise SimSessionError(
+                raise EndpointTakenError(
                     f"{endpoint}: {error.strerror}; expected a free port. End the other companion play or "
                     "companion run, or set --zenoh-listen tcp/127.0.0.1:PORT"
                 ) from error

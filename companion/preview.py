@@ -160,7 +160,7 @@ def attitudes_of(settings: Settings) -> Iterator[CameraTelemetry]:
     """
     from companion.guidance.targets.from_detections import HistoryError, StateHistory
     from companion.service.factory import driver_of
-    from companion.vehicle.driver import LinkError
+    from companion.vehicle.driver import LinkUnavailableError
 
     telemetry, history = CameraTelemetry(), StateHistory()
     opened: Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = Future()
@@ -188,7 +188,7 @@ def attitudes_of(settings: Settings) -> Iterator[CameraTelemetry]:
             opened.set_result((asyncio.get_running_loop(), ended))
             await ended.wait()
         except TimeoutError:
-            raise LinkError(f"{url}: no attitude received within {timeout_s:g} s") from None
+            raise LinkUnavailableError(f"{url}: no attitude received within {timeout_s:g} s") from None
         finally:
             await driver.close()
 

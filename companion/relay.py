@@ -16,7 +16,7 @@ from typing import NamedTuple
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
-from companion.vehicle.driver import LinkError
+from companion.vehicle.driver import LinkError, LinkUnavailableError
 from companion.vehicle.link_url import LinkScheme, LinkUrl, parse_link_url
 from companion.vehicle.reception import Reception
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S
@@ -91,13 +91,14 @@ class Relay:
         """Wait for the autopilot and check that it is one multirotor, disarmed.
 
         Raises:
-            ValueError: no autopilot, several, not PX4 or ArduPilot, not a multirotor, or armed; one line.
+            LinkUnavailableError: no autopilot.
+            ValueError: several, not PX4 or ArduPilot, not a multirotor, or armed; one line.
         """
         try:
             async with asyncio.timeout(_FIRST_HEARTBEAT_S):
                 await self._first_heartbeat.wait()
         except TimeoutError:
-            raise ValueError(
+            raise LinkUnavailableError(
                 f"{self.url}: no autopilot heartbeat within {_FIRST_HEARTBEAT_S:g} s; "
                 "check that it is running and sends to this port"
             ) from None

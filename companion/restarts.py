@@ -1,4 +1,4 @@
-"""When a program that ended by itself is started again: soon at first, then every 30 s, without end."""
+"""When what ended by itself is started again: soon at first, then every 30 s, without end."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 SOON_S = (0.2, 1.0, 2.0, 4.0, 8.0)
 LATER_S = 30.0
-# A program that lasted so long had no fault from its beginning.
+# What lasted so long had no fault from its beginning.
 LASTED_S = 30.0
+# The same reason again is reported with every so many tries that are not soon.
+_REPORTED_TRIES = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,10 +18,12 @@ class Restart:
 
     Attributes:
         pause_s: until then, seconds. count: of ends since it last lasted.
+        reported: whether to report the end: it is a new one, or was not reported for several tries.
     """
 
     pause_s: float
     count: int
+    reported: bool = True
 
     @property
     def later(self) -> bool:
@@ -33,7 +37,7 @@ class Restart:
 
 
 class Restarts:
-    """Counts the ends of one program.
+    """Counts the ends of one program or task.
 
     >>> restarts = Restarts()
     >>> [restarts.after(lasted_s=1.0).pause_s for _ in range(7)]
@@ -44,8 +48,15 @@ class Restarts:
 
     def __init__(self) -> None:
         self._count = 0
+        self._reported = ("", 0)
 
-    def after(self, lasted_s: float) -> Restart:
-        """Return the next start of a program that has ended after `lasted_s` seconds."""
-        self._count = 1 if lasted_s >= LASTED_S else self._count + 1
-        return Restart(SOON_S[self._count - 1] if self._count <= len(SOON_S) else LATER_S, self._count)
+    def after(self, lasted_s: float, reason: str = "") -> Restart:
+        """Return the next start of what has ended after `lasted_s` seconds, for a reason."""
+        self._count = count = 1 if lasted_s >= LASTED_S else self._count + 1
+        if count <= len(SOON_S):
+            return Restart(SOON_S[count - 1], count)
+        before, reported_count = self._reported
+        reported = reason != before or not 0 <= count - reported_count < _REPORTED_TRIES
+        if reported:
+            self._reported = (reason, count)
+        return Restart(LATER_S, count, reported)

@@ -21,6 +21,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
+from companion.load import busy_text
+from companion.passing import PassingError
 from companion.relay import Relay
 from companion.service import Service
 from companion.settings import Settings
@@ -84,6 +86,10 @@ class SimOptions:
     gcs_port: int | None = None
 
 
+class SimUnavailableError(SimSessionError, PassingError):
+    """It did not start in time, or has ended: another start may succeed."""
+
+
 class SimProcess:
     """A running `mavlink-sim`: the vehicle with its camera, or the camera alone.
 
@@ -115,7 +121,9 @@ class SimProcess:
             if not ready.done():
                 raise SimSessionError(f"the simulator did not start: {self._last_output()}")
         except TimeoutError as error:
-            raise SimSessionError(f"the simulator was not ready within {_SIMULATOR_START_S:g} s") from error
+            raise SimUnavailableError(
+                f"the simulator was not ready within {_SIMULATOR_START_S:g} s{busy_text()}"
+            ) from error
         finally:
             lost.cancel()
             ready.cancel()
@@ -342,6 +350,8 @@ async def until_ready_to_arm(service: Service) -> None:
         async with asyncio.timeout(_ARMABLE_S):
             await armable.wait()
     except TimeoutError as error:
-        raise SimSessionError(f"the vehicle was not ready to arm within {_ARMABLE_S:g} s") from error
+        raise SimUnavailableError(
+            f"the vehicle was not ready to arm within {_ARMABLE_S:g} s{busy_text()}"
+        ) from error
     finally:
         unsubscribe()

@@ -1,11 +1,14 @@
-"""Tasks: background ones that do not end unseen, and some that begin and end together."""
+"""Tasks: background ones that do not end unseen or for ever, and some that begin and end together."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Coroutine, Iterable
+import time
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any, TypeVar
+
+from companion.restarts import Restarts
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +32,39 @@ def _on_end(task: asyncio.Task[Any]) -> None:
     _running.discard(task)
     if not task.cancelled() and (error := task.exception()) is not None:
         logger.error("%s has ended: %s: %s", task.get_name(), type(error).__name__, error, exc_info=error)
+
+
+async def keep_running(
+    name: str,
+    work: Callable[[], Coroutine[Any, Any, None]],
+    on_event: Callable[[str, str], None] = lambda _level, _text: None,
+) -> None:
+    """Run `work` until it returns. An exception is a fault of ours: it is reported, and `work` runs again.
+
+    For what the service can do without for a while. A fault of what steers ends the service, in HOLD.
+
+    Args:
+        name: for people. work: called for every run, after the pauses of `Restarts`.
+        on_event: called with (level, text), besides the log.
+    """
+    restarts = Restarts()
+    while True:
+        begun_s = time.monotonic()
+        try:
+            await work()
+            return
+        except Exception as error:
+            reason = error_text(error)
+            restart = restarts.after(time.monotonic() - begun_s, reason)
+            if restart.reported:
+                logger.exception("%s failed; %s", name, restart)
+                on_event("error", f"{name} failed: {reason}; {restart}")
+        await asyncio.sleep(restart.pause_s)
+
+
+def error_text(error: BaseException) -> str:
+    """Return an unexpected error in one line, with its type."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 async def start_together(*starts: Coroutine[Any, Any, None]) -> None:

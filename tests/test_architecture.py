@@ -14,7 +14,7 @@ ROOT = Path(__file__).parent.parent
 # Each package and module of `companion` with its layer; it may import from lower layers alone.
 COMPANION_LAYERS = {
     "campaign": 0,
-    "child_process": 1,
+    "child_process": 2,
     "clock": 0,
     "config_check": 9,
     "geometry": 0,
@@ -25,7 +25,8 @@ COMPANION_LAYERS = {
     "restarts": 0,
     "scheduling": 0,
     "load": 0,
-    "tasks": 0,
+    "passing": 0,
+    "tasks": 1,
     "toml_text": 0,
     "settings": 1,
     "vehicle": 2,

@@ -7,6 +7,7 @@ from typing import Any
 
 import zenoh
 
+from companion.passing import PassingError
 from companion.settings import ZenohSection
 from vision.redaction import redacted
 
@@ -18,7 +19,7 @@ class BusError(ConnectionError):
         super().__init__(redacted(text))
 
 
-class EndpointTakenError(BusError):
+class EndpointTakenError(BusError, PassingError):
     """An endpoint to listen on is not available now: its port is in use, or its interface is not up yet."""
 
 

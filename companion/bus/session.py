@@ -39,7 +39,7 @@ from companion.bus.topics import (
 from companion.peer_data import Payload, copy_payload
 from companion.scheduling import set_scheduler_slice
 from companion.settings import ZenohSection
-from companion.tasks import spawn
+from companion.tasks import error_text, keep_running, spawn
 from vision.redaction import redacted
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]
@@ -168,7 +168,7 @@ class Bus:
         config = service_config(self._settings)
         if json.loads(config.get_json("mode")) != "client":
             try:
-                self._adopt(await asyncio.to_thread(_open, config))
+                await self._adopt(await asyncio.to_thread(_open, config))
             except zenoh.ZError as error:
                 endpoints = ", ".join(self._settings.listen)
                 # An error of the system may pass, one of zenoh is of the settings.
@@ -177,7 +177,7 @@ class Bus:
                     f"zenoh cannot listen on {endpoints}: {first_line(error)}. "
                     "If a router or another service uses it, set zenoh.connect to it and zenoh.listen to none"
                 ) from error
-        self._watching = self._spawn(self._watch())
+        self._watching = self._spawn(keep_running("zenoh", self._watch, self._on_event))
 
     async def close(self) -> None:
         """Close the session; bounded in time."""
@@ -294,8 +294,19 @@ class Bus:
             return
         self.published[path] += 1
 
-    def _adopt(self, session: zenoh.Session) -> None:
+    async def _adopt(self, session: zenoh.Session) -> None:
+        """Use a session. One on which not everything can be declared is closed."""
+        try:
+            self._declare_all(session)
+        except Exception:
+            for declared in (self._matching, self._queryables, self._received, self._subscribers):
+                declared.clear()
+            self._publishers.clear()
+            await asyncio.to_thread(session.close)
+            raise
         self._session = session
+
+    def _declare_all(self, session: zenoh.Session) -> None:
         for topic, view in self._streams:
             self._declare(session, topic, view)
         # zenoh removes the token when this process ends, in any way.
@@ -398,6 +409,10 @@ class Bus:
         except (TimeoutError, KeyError) as error:
             await self._in(self._query_replies, _reply_error, query, f"{path}: {error}")
             return
+        except Exception as error:  # else its sender would wait until its own time-out
+            logger.exception("the query %s failed", path)
+            await self._in(self._query_replies, _reply_error, query, f"{path}: {error_text(error)}")
+            return
         key = f"{ROOT}/{self._vehicle}/{path}"
         await self._in(self._query_replies, _reply_body, query, key, body)
 
@@ -419,7 +434,7 @@ class Bus:
         endpoints = ", ".join(self._settings.connect)
         while self._session is None:
             try:
-                self._adopt(await asyncio.to_thread(_open, service_config(self._settings)))
+                await self._adopt(await asyncio.to_thread(_open, service_config(self._settings)))
             except zenoh.ZError:
                 if not reported:
                     self._on_event("warning", f"zenoh: no peer at {endpoints}, retrying")

@@ -19,6 +19,7 @@ import typer.core
 import typer.main
 
 from companion.journal import marked_for_journal
+from companion.passing import EXIT_PASSING, PassingError
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
 from vision.redaction import redacted
@@ -30,7 +31,6 @@ if TYPE_CHECKING:
 
 EXIT_FAILED = 1
 EXIT_BAD_INPUT = 2
-EXIT_PASSING = 75  # EX_TEMPFAIL of sysexits.h: another start may succeed
 YOLO = "yolo"  # vision.object_detector.YOLO, without numpy
 _GIVEN = "companion.settings given as flags"  # in a context's `meta`
 
@@ -114,13 +114,17 @@ def _flag_of(key: str) -> str:
 
 @contextmanager
 def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iterator[None]:
-    """Print errors of these types as one-line messages and exit with `code`."""
+    """Print errors of these types as one-line messages and exit with `code`.
+
+    An error that may pass is always printed so, and the code is then EXIT_PASSING.
+    """
+    printed: tuple[type[Exception], ...] = (*expected, PassingError)
     try:
         yield
-    except expected as error:
+    except printed as error:
         for line in str(error).splitlines():
             typer.echo(redacted(f"companion: {line}"), err=True)
-        raise typer.Exit(code) from error
+        raise typer.Exit(EXIT_PASSING if isinstance(error, PassingError) else code) from error
 
 
 def say_silent(text: str) -> None:

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, EXIT_PASSING, plain_errors
+from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.passing import EXIT_PASSING
 
 if TYPE_CHECKING:
     from companion.models.pull import Pulled

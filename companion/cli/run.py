@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, EXIT_PASSING, plain_errors, warn_rendered_only
+from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
 from companion.cli.models import Pull, model_after_pull
 from companion.journal import log_to_standard_error
 from companion.tasks import spawn
@@ -46,11 +46,11 @@ def after_pull(settings: Settings) -> Settings:
 def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: None) -> None:
     """Run the service, as `run`. `on_page` is called with the page's line that has its address."""
     with gc_paused():
-        from companion.bus.config import BusError, EndpointTakenError
+        from companion.bus.config import BusError
         from companion.config_check import check_settings
         from companion.language.process import AskProcess
         from companion.operator.line_output import use_for_standard_error
-        from companion.operator.metrics import AddressTakenError, MetricsError
+        from companion.operator.metrics import MetricsError
         from companion.perception.supervisor import PerceptionStartError
         from companion.plugins import PluginError
         from companion.service import Service
@@ -60,12 +60,8 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
     # A stalled reader of standard error must not block the service. Before any handler uses the stream.
     output = use_for_standard_error()
     log_to_standard_error(settings.log.level.upper(), "%(levelname)s %(name)s: %(message)s")
-    with (
-        plain_errors(
-            *(ConfigurationError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
-        ),
-        plain_errors(EndpointTakenError, AddressTakenError, code=EXIT_PASSING),
-    ):
+    wrong = (ConfigurationError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
+    with plain_errors(*wrong):
         check_settings(settings)  # what is missing is reported by its part
         service = Service(
             settings,

@@ -1,6 +1,6 @@
 """The dashboard as a child process: `python -m companion.dashboard`, options as JSON in the argument.
 
-It prints the page's address, or one line why there is none. It ends with its parent.
+It prints the page's address, or one line why there is none now, or never. It ends with its parent.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
+from companion.passing import EXIT_PASSING, PassingError
 from companion.scheduling import lower_priority
 from companion.settings import LanguageSection
 
@@ -30,9 +31,9 @@ def main(argument: str) -> int:
     try:
         options = DashboardOptions(zenoh=zenoh, language=language, plugins=plugins, **values)
         asyncio.run(serve(options, lambda url: print(url, flush=True), "--dashboard-listen"))
-    except (DashboardError, BusError) as error:
+    except (DashboardError, BusError, PassingError) as error:
         print(error, flush=True)
-        return EXIT_REFUSED
+        return EXIT_PASSING if isinstance(error, PassingError) else EXIT_REFUSED
     return 0
 
 

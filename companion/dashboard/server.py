@@ -34,6 +34,7 @@ from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
 from companion.dashboard.connections import connection_class, connection_of
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
+from companion.passing import AddressTakenError
 from companion.settings import LanguageSection, ZenohSection
 from companion.tasks import spawn
 
@@ -105,7 +106,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag
         flag: what sets the address, for errors.
 
     Raises:
-        DashboardError: the address is in use or not available, or the token is missing.
+        AddressTakenError: the address is in use or not available. DashboardError: the token is missing.
     """
     host, port = split_listen(options.listen)
     token = None if options.token_file is None else read_token(options.token_file)
@@ -155,11 +156,11 @@ def split_listen(listen: str, name: str = "dashboard.listen") -> tuple[str, int]
 
 
 def listening_socket(host: str, port: int, flag: str) -> socket.socket:
-    """Open the server's socket. `flag`: what sets its address, for errors. Raises DashboardError."""
+    """Open the server's socket. `flag`: what sets its address, for errors. Raises AddressTakenError."""
     try:
         listener = socket.create_server((host, port))
     except OSError as error:
-        raise DashboardError(
+        raise AddressTakenError(
             f"cannot listen on {host}:{port}: {error.strerror or error}; {flag} sets another address"
         ) from error
     # Accepted connections inherit these.

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
+from companion.passing import AddressTakenError
 from vision.extras import install_command
 
 if TYPE_CHECKING:
@@ -20,10 +21,6 @@ Status = Mapping[str, Any]
 
 class MetricsError(RuntimeError):
     """The endpoint cannot be opened. The message is one line."""
-
-
-class AddressTakenError(MetricsError):
-    """The address is not available now."""
 
 
 class MetricsServer:

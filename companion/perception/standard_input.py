@@ -69,6 +69,11 @@ class StandardInput:
         self._closed = False
         self._thread: threading.Thread | None = None
 
+    @property
+    def ended(self) -> bool:
+        """Whether its writer has closed it: no worker gets a frame any more."""
+        return self._closed
+
     def for_worker(self) -> int:
         """Return a descriptor for the next worker's standard input. The caller closes it."""
         if not self._is_stream:

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from companion.load import busy_text
+from companion.passing import PassingError
 from companion.perception.messages import (
     AnyPreview,
     Attitude,
@@ -40,7 +41,7 @@ from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
 from companion.restarts import Restart, Restarts
 from companion.settings import Settings
-from companion.tasks import spawn
+from companion.tasks import error_text, spawn
 from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
@@ -52,8 +53,6 @@ logger = logging.getLogger(__name__)
 
 __all__ = ["PerceptionStartError", "PerceptionState", "PerceptionStatus", "PerceptionSupervisor"]
 
-# The same reason again is reported with every so many tries that are not soon.
-_REPORTED_TRIES = 10
 STOP_S, TERMINATE_S = 5.0, 1.0
 # A selection is answered with the next processed frame.
 SELECT_TIMEOUT_S = 3.0
@@ -63,6 +62,10 @@ _RATE_WINDOW_S = 2.0
 
 class PerceptionStartError(RuntimeError):
     """Perception cannot start with its settings. The message is one line."""
+
+
+class PerceptionUnavailableError(PerceptionStartError, PassingError):
+    """Perception does not run now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +141,6 @@ class PerceptionSupervisor:
         self._problem = ""
         self._restarts = 0
         self._pauses = Restarts()
-        self._reported = ("", 0)
         self._ready_s: float | None = None
         self._next_try_ns: int | None = None
         self._lost_s: float | None = None
@@ -166,7 +168,6 @@ class PerceptionSupervisor:
         self._state = PerceptionState.STARTING
         started: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._task = spawn(self._run(started), "perception supervisor")
-        self._task.add_done_callback(self._on_fault)
         try:
             await asyncio.wait({started, self._task}, return_when=asyncio.FIRST_COMPLETED)
         except asyncio.CancelledError:
@@ -332,18 +333,16 @@ class PerceptionSupervisor:
             return 0.0
         return (len(self._arrivals_s) - 1) / (now_s - self._arrivals_s[0])
 
-    def _on_fault(self, task: asyncio.Task[None]) -> None:
-        """Report an exception of the supervisor or of a callback."""
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._state = PerceptionState.FAILED
-            self._problem = f"{type(error).__name__}: {error}"
-            self._on_event("error", f"perception failed: {self._problem}")
-
     # --- successive workers
 
     async def _run(self, started: asyncio.Future[None]) -> None:
         while True:
-            end = await self._run_one(started)
+            try:
+                end = await self._run_one(started)
+            except Exception as error:  # a fault of ours or of a callback: as that of a worker
+                end = _End(False, error_text(error))
+                if end.text != self._problem:
+                    logger.exception("the supervision of a worker has failed")
             if self._stop_asked.is_set():
                 self._after_stop(end)
                 return
@@ -354,6 +353,12 @@ class PerceptionSupervisor:
             self._problem = end.text
             if end.wrong_settings and not started.done():
                 self._state = PerceptionState.FAILED
+                return
+            if self._input is not None and self._input.ended:
+                self._state = PerceptionState.FAILED
+                self._on_event("error", f"perception ended: {end.text}; standard input has no more frames")
+                if not started.done():
+                    started.set_result(None)
                 return
             restart = self._after_death(end)
             self._state = PerceptionState.FAILED if restart.later else PerceptionState.RESTARTING
@@ -381,15 +386,12 @@ class PerceptionSupervisor:
         now_s = time.monotonic()
         if self._ready is not None:
             self._lost_s = self._lost_s or now_s
-        restart = self._pauses.after(0.0 if self._ready_s is None else now_s - self._ready_s)
+        restart = self._pauses.after(0.0 if self._ready_s is None else now_s - self._ready_s, end.text)
         self._ready_s = None
-        text = f"perception {'not started' if self._ready is None else 'lost'}: {end.text}; {restart}"
-        reason, count = self._reported
-        if not restart.later:
-            self._on_event("warning", text)
-        elif end.text != reason or not 0 <= restart.count - count < _REPORTED_TRIES:
-            self._reported = (end.text, restart.count)
-            self._on_event("error", text)
+        if restart.reported:
+            lost = "not started" if self._ready is None else "lost"
+            level = "error" if restart.later else "warning"
+            self._on_event(level, f"perception {lost}: {end.text}; {restart}")
         return restart
 
     async def _run_one(self, started: asyncio.Future[None]) -> _End:

@@ -34,6 +34,7 @@ from companion.perception.messages import (
     GimbalAttitude,
     Heartbeat,
     Hud,
+    Message,
     Ready,
     Report,
     ResultLogHandler,
@@ -44,6 +45,7 @@ from companion.perception.messages import (
     receive,
 )
 from companion.perception.previews import CloudEncoder, PreviewEncoder
+from companion.perception.standard_input import STANDARD_INPUT
 from companion.plugins import PluginError, load_plugins
 from companion.scheduling import lower_priority, run_when_idle
 from companion.settings import Settings
@@ -59,6 +61,7 @@ from vision.redaction import print_traceback, redacted
 from vision.runtimes.exported import kind_of
 from vision.sources import EndOfStream, Source, SourceError, SourceUnavailableError, check_there, open_source
 from vision.sources.shared import FrameSharing
+from vision.sources.source import NoFrameError
 from vision.tracking import Selected, SelectRequest
 from vision.video_writer import VideoWriterError
 
@@ -79,7 +82,7 @@ class ControlChannel:
     """The service's control messages, received by a thread.
 
     Attributes:
-        stopping: end now.
+        stopping: end now. asked: the service has asked for it.
         hud: overlay of the recorded video's next frames.
         telemetry: of the vehicle.
         watched: which previews are wanted.
@@ -88,7 +91,7 @@ class ControlChannel:
     """
 
     def __init__(self, connection: socket.socket) -> None:
-        self.stopping = False
+        self.stopping = self.asked = False
         self.hud = Hud((), None)
         self.watched = Watched(False)
         self.selections: deque[SelectRequest] = deque()
@@ -107,29 +110,36 @@ class ControlChannel:
         self._finished.set()
 
     def _receive(self) -> None:
-        while (message := receive(self._connection)) is not None:
-            if isinstance(message, Hud):
-                self.hud = message
-            elif isinstance(message, Attitude):
-                self.telemetry.attitudes.add(message.stamp_ns, message.wxyz)
-                self.telemetry.height_m = message.height_m
-                self.telemetry.in_flight = message.in_flight
-                if message.position is not None:
-                    self.telemetry.positions.add(*message.position)
-            elif isinstance(message, GimbalAttitude):
-                self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
-            elif isinstance(message, Watched):
-                self.watched = message
-            elif isinstance(message, PathRequest):
-                self.path_request = (message, time.monotonic_ns())
-            elif isinstance(message, SelectRequest):
-                self.selections.append(message)
-            elif isinstance(message, Stop):
-                self.stop()
-        # The service is gone. A thread still blocked in a driver after the grace time never returns.
-        self.stop()
-        if not self._finished.wait(GRACE_S):
-            os._exit(1)
+        try:
+            while (message := receive(self._connection)) is not None:
+                self._take(message)
+        finally:
+            # The service is gone, or this has failed: without attitudes and requests the worker is replaced.
+            # A thread still blocked in a driver after the grace time never returns.
+            self.stop()
+            if not self._finished.wait(GRACE_S):
+                os._exit(1)
+
+    def _take(self, message: Message) -> None:
+        if isinstance(message, Hud):
+            self.hud = message
+        elif isinstance(message, Attitude):
+            self.telemetry.attitudes.add(message.stamp_ns, message.wxyz)
+            self.telemetry.height_m = message.height_m
+            self.telemetry.in_flight = message.in_flight
+            if message.position is not None:
+                self.telemetry.positions.add(*message.position)
+        elif isinstance(message, GimbalAttitude):
+            self.telemetry.gimbal.add(message.stamp_ns, message.wxyz)
+        elif isinstance(message, Watched):
+            self.watched = message
+        elif isinstance(message, PathRequest):
+            self.path_request = (message, time.monotonic_ns())
+        elif isinstance(message, SelectRequest):
+            self.selections.append(message)
+        elif isinstance(message, Stop):
+            self.asked = True
+            self.stop()
 
 
 class ProcessedFrames:
@@ -236,6 +246,9 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
                     adopted = adopt_calibration(settings.camera, perception.source.calibration).camera
                     settings = settings.model_copy(update={"camera": adopted})
                     perception.clouds.camera = adopted
+        except NoFrameError as error:
+            # Of standard input the program that should write to it has failed, not our settings.
+            return StartFailed(_one_line(error), wrong_settings=settings.source.uri != STANDARD_INPUT)
         except (SourceUnavailableError, MemoryError) as error:
             return StartFailed(_one_line(error) or type(error).__name__, wrong_settings=False)
         except (PluginError, SourceError, VideoWriterError, ValueError) as error:  # with CheckpointError
@@ -272,7 +285,8 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             print_traceback()
             return Ended(False, f"{type(error).__name__}: {_one_line(error)}", pipeline.frames)
         frames = pipeline.frames
-    return Ended(True, "stop requested", frames)
+    text = "stop requested" if control.asked else "stopped by a signal, or without the service's messages"
+    return Ended(control.asked, text, frames)
 
 
 @contextlib.contextmanager

@@ -13,7 +13,8 @@ from threading import Event
 from companion.bus.client import NoAnswerError, open_client, settings_in_child
 from companion.bus.config import BusError
 from companion.child_process import EXIT_REFUSED, on_parent_end
-from companion.recording import RecordingError
+from companion.passing import EXIT_PASSING, PassingError
+from companion.recording import PAUSED, RecordingError
 from companion.settings import ZenohSection
 from vision.extras import missing_module
 
@@ -42,7 +43,10 @@ def main(argument: str) -> int:
     except ModuleNotFoundError as error:
         _say(missing_module(error) or str(error))
         return EXIT_REFUSED
-    except (RecordingError, NoAnswerError, BusError) as error:
+    except (PassingError, NoAnswerError) as error:  # or the node has gone since
+        _say(str(error))
+        return EXIT_PASSING
+    except (RecordingError, BusError) as error:
         _say(str(error))
         return EXIT_REFUSED
     return 0
@@ -57,7 +61,7 @@ def _wait_for_node(zenoh: ZenohSection, ending: Event) -> bool:
                 return True
         except NoAnswerError as error:
             if not said:
-                _say(f"{error}; retrying")
+                _say(f"{PAUSED}{error}; retrying")
             said = True
         ending.wait(_RETRY_S)
     return False

@@ -16,6 +16,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 
 from companion.bus.client import message_of, open_client
 from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS, Topic
+from companion.passing import AddressTakenError
 from companion.recording import RecordingError
 from companion.recording.convert import Converter, large_channel
 from companion.recording.files import Channel
@@ -50,7 +51,7 @@ class Live(ServerListener):
                 name=f"companion {options.vehicle}", host=host, port=int(port), server_listener=self
             )
         except Exception as error:  # of the SDK, without a common base
-            raise RecordingError(f"foxglove.listen: {options.listen} cannot be served: {error}") from error
+            raise AddressTakenError(f"foxglove.listen: {options.listen} cannot be served: {error}") from error
         topics = [topic for topic in (*TOPICS, RUN) if topic not in LARGE_TOPICS]
         self._subscribers = subscribe_all(session, options.vehicle, topics, self._on_sample)
 
@@ -110,7 +111,12 @@ class Live(ServerListener):
 
 
 def serve(options: LiveOptions, ending: Event, say: Callable[[str], None]) -> None:
-    """Serve until `ending` is set. Raises RecordingError; NoAnswerError: no service at the endpoint."""
+    """Serve until `ending` is set.
+
+    Raises:
+        RecordingError: the address is not one of this computer alone. AddressTakenError: it is taken.
+        NoAnswerError: no service at the endpoint.
+    """
     host = options.listen.rpartition(":")[0].strip("[]")
     if host != "localhost" and not ipaddress.ip_address(host).is_loopback:
         raise RecordingError(

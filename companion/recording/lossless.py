@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import threading
 import time
 import zlib
@@ -19,6 +20,10 @@ from vision.shared_frame import SharedFrameReader
 # Shared memory does not notify; a poll of one camera takes some microseconds.
 _POLL_S = 0.005
 _REOPEN_S = 0.5
+# After a fault of ours: with its traceback.
+_FAULT_S = 30.0
+
+logger = logging.getLogger(__name__)
 
 
 class FrameWriter(Protocol):
@@ -67,7 +72,15 @@ class _Camera:
         self._after: int | None = None
 
     def encode(self, recorder: FrameWriter) -> None:
-        """Pass the newest frame on, if it is new."""
+        """Pass the newest frame on, if it is new. Never raises: a frame that cannot be read is dropped."""
+        try:
+            self._encode(recorder)
+        except Exception:
+            logger.exception("%s: a frame could not be recorded", self._path)
+            self._open_due_s = time.monotonic() + _FAULT_S
+            self.close()
+
+    def _encode(self, recorder: FrameWriter) -> None:
         reader = self._opened()
         try:
             frame = None if reader is None else reader.latest(self._after)

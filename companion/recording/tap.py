@@ -103,8 +103,16 @@ class FlightTap:
 
     def _publish_until_closed(self) -> None:
         while not self._closing.wait(PERIOD_S):
+            self._try_to_publish()
+        self._try_to_publish()
+
+    def _try_to_publish(self) -> None:
+        try:
             self._publish()
-        self._publish()
+        except Exception:
+            if not self._failed:
+                logger.exception("steps and bytes cannot be recorded (logged once)")
+            self._failed = True
 
     def _publish(self) -> None:
         if not self._bus.watched(RUN):

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
+from functools import partial
 from typing import Any
 
 from companion.bus.client import NoAnswerError, settings_for_child
@@ -18,7 +19,7 @@ from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.perception.cameras import recorded_frames_names
-from companion.recording import LISTENING, RECORDED, RECORDING
+from companion.recording import LISTENING, PAUSED, RECORDED, RECORDING
 from companion.settings import CameraSection, Settings
 from companion.settings.vehicle import COMPONENT_IDS
 from companion.vehicle.driver import Driver, OnBytes
@@ -108,13 +109,14 @@ def limits_of(settings: Settings) -> Limits:
 
 @asynccontextmanager
 async def clients_of(
-    settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str], None]
+    settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str, bool], None]
 ) -> AsyncIterator[None]:
     """Run meanwhile the clients that are set: the recorder, and Foxglove live.
 
     Args:
-        on_event: called with (level, text). on_state: called with a client's name and why it does not work;
-            empty: it does.
+        on_event: called with (level, text).
+        on_state: called with a client's name, why it does not work (empty: it does), and whether it is
+            tried again.
     """
     programs: dict[str, dict[str, Any]] = {}
     if settings.recording.directory:
@@ -131,17 +133,26 @@ async def clients_of(
         name, _, text = line.partition(": ")
         well = text.startswith(_ROUTINE)
         on_event("info" if well else "warning", line)
-        on_state(name, "" if well else text)
+        if well or text.startswith(PAUSED):  # any other line, such as a library's, is no state
+            on_state(name, "" if well else text, True)
 
     async with AsyncExitStack() as stack:
         for name, options in programs.items():
-            on_state(name, "it is starting")
+            on_state(name, "it is starting", True)
             try:
                 zenoh = settings_for_child(settings.zenoh)
             except (NoAnswerError, BusError) as error:
                 say(f"{name}: {error}")
+                on_state(name, str(error), False)
                 continue
             argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
-            program = child_process(name, "companion.recording", argument, say, end_s=_END_S[name])
+            program = child_process(
+                name,
+                "companion.recording",
+                argument,
+                say,
+                on_end=partial(on_state, name),
+                end_s=_END_S[name],
+            )
             await stack.enter_async_context(program)
         yield

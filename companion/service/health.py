@@ -11,6 +11,7 @@ from companion.perception.cameras import WorkerCamera
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
+from companion.tasks import keep_running
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, parameter_names
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.setpoint_loss import SetpointLossOutcome, setpoint_loss_outcome
@@ -74,6 +75,10 @@ class Health:
 
     async def run(self) -> None:
         """Run `check` whenever the link has opened or returned, or the autopilot has restarted."""
+        await keep_running("health", self._check_when_due, self._on_event)
+
+    async def _check_when_due(self) -> None:
+        self._check_due.set()  # also after a fault in the last one
         while True:
             await self._check_due.wait()
             self._check_due.clear()

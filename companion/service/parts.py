@@ -6,20 +6,22 @@ Each has a state with a reason, for `status`, the page and the answers to comman
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from enum import StrEnum
+from dataclasses import replace
 
 from companion.bus.bodies.service import PartBody
 from companion.bus.session import Bus
 from companion.perception.cameras import WorkerCamera
-from companion.perception.status import PerceptionState
-from companion.perception.supervisor import PerceptionStartError
+from companion.perception.supervisor import PerceptionStartError, PerceptionUnavailableError
+from companion.service.part import Part, PartState, part_of_camera
 from companion.settings.perception import NO_SOURCE
 from companion.settings.vehicle import VehicleSection
-from companion.tasks import start_together
-from companion.vehicle.driver import Driver, LinkError
+from companion.tasks import error_text, start_together
+from companion.vehicle.driver import Driver, LinkError, LinkUnavailableError
+
+logger = logging.getLogger(__package__)
 
 AUTOPILOT, ZENOH = "autopilot", "zenoh"
 NO_VEHICLE_TEXT = "there is no vehicle: vehicle.url is none"
@@ -28,56 +30,6 @@ RETRY_S = 2.0
 # A vehicle that is on answers within this time: until then nothing is reported.
 _QUIET_S = 3.0
 _POLL_S = 0.1
-
-
-class PartState(StrEnum):
-    """State of a part."""
-
-    STARTING = "starting"
-    READY = "ready"
-    MISSING = "missing"  # nothing answers; it is used as soon as it does
-    RETRYING = "retrying"  # has failed, and is tried again within seconds
-    FAILED = "failed"  # has failed repeatedly, and is tried again every 30 s
-    FINISHED = "finished"  # a source that has ended
-
-
-_OF_CAMERAS = {
-    PerceptionState.STOPPED: PartState.STARTING,
-    PerceptionState.STARTING: PartState.STARTING,
-    PerceptionState.RUNNING: PartState.READY,
-    PerceptionState.RESTARTING: PartState.RETRYING,
-    PerceptionState.FINISHED: PartState.FINISHED,
-    PerceptionState.FAILED: PartState.FAILED,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """What is known of a part. Times are CLOCK_MONOTONIC nanoseconds.
-
-    Attributes:
-        name: autopilot, zenoh, camera, `camera NAME`, recorder or foxglove.
-        reason: why it is not ready; empty: it is, or it is not known yet.
-        since_ns: begin of the state. next_try_ns: None: it is tried all the time, or needs no try.
-    """
-
-    name: str
-    state: PartState
-    reason: str = ""
-    next_try_ns: int | None = None
-    since_ns: int = 0
-
-    @property
-    def up(self) -> bool:
-        """Whether it needs nothing more."""
-        return self.state in (PartState.READY, PartState.FINISHED)
-
-    def text(self, now_ns: int) -> str:
-        """What is missing and why, for an operator."""
-        text = f"{self.name}: {self.reason or self.state.value}"
-        if self.next_try_ns is not None:
-            text += f" (next try in {max(self.next_try_ns - now_ns, 0) / 1e9:.0f} s)"
-        return text
 
 
 class Parts:
@@ -103,14 +55,15 @@ class Parts:
         self._clients: dict[str, Part] = {}
         self._been_up: set[str] = set()
 
-    def on_client(self, name: str, problem: str) -> None:
-        """Note why a client that the service runs does not work; empty: it does."""
-        self._clients[name] = Part(name, PartState.RETRYING if problem else PartState.READY, problem)
+    def on_client(self, name: str, problem: str, again: bool) -> None:
+        """Note why a client that the service runs does not work; empty: it does. `again`: it is retried."""
+        failed = PartState.RETRYING if again else PartState.FAILED
+        self._clients[name] = Part(name, failed if problem else PartState.READY, problem)
 
     def now(self, now_ns: int) -> tuple[Part, ...]:
         """Return all parts, the autopilot first."""
         parts = [self._autopilot(now_ns)] if self._has_vehicle else []
-        parts += [_of_camera(camera) for camera in self._cameras]
+        parts += [part_of_camera(camera) for camera in self._cameras]
         missing = self._bus.missing
         parts.append(Part(ZENOH, PartState.MISSING if missing else PartState.READY, missing))
         parts += self._clients.values()
@@ -164,8 +117,14 @@ class Parts:
                 await self._driver.connect(None, lambda reason: self._awaited(reason, began_s))
                 return
             except LinkError as error:
-                next_ns = time.monotonic_ns() + round(RETRY_S * 1e9)
-                self._note(Part(AUTOPILOT, PartState.RETRYING, str(error), next_ns))
+                reason = str(error)
+            except Exception as error:  # a fault of ours, for example with what was received
+                reason = error_text(error)
+                if reason != self._link.reason:
+                    logger.exception("the connection to the autopilot has failed")
+            self._note(
+                Part(AUTOPILOT, PartState.RETRYING, reason, time.monotonic_ns() + round(RETRY_S * 1e9))
+            )
             await asyncio.sleep(RETRY_S)
 
     def _awaited(self, reason: str, began_s: float) -> None:
@@ -203,7 +162,7 @@ class Parts:
                 None: without limit.
 
         Raises:
-            LinkError, PerceptionStartError: with `within_s`, for autopilot and cameras.
+            LinkUnavailableError, PerceptionUnavailableError: with `within_s`, for autopilot and cameras.
         """
         deadline_s = None if within_s is None else time.monotonic() + within_s
         others = {ZENOH, *self._clients} | (set() if autopilot else {AUTOPILOT})
@@ -215,8 +174,10 @@ class Parts:
             for part in waiting if deadline_s is not None else ():
                 assert deadline_s is not None
                 late = time.monotonic() > deadline_s and part.name == AUTOPILOT
-                if late or part.state in (PartState.RETRYING, PartState.FAILED):
-                    error = LinkError if part.name == AUTOPILOT else PerceptionStartError
+                # Wrong settings are never tried again, and end `run`.
+                failed = part.state is PartState.FAILED and part.next_try_ns is not None
+                if late or failed or part.state is PartState.RETRYING:
+                    error = LinkUnavailableError if part.name == AUTOPILOT else PerceptionUnavailableError
                     raise error(part.reason or f"{part.name}: not ready within {within_s:g} s")
             await asyncio.sleep(_POLL_S)
 
@@ -233,13 +194,3 @@ class Parts:
         if self._driver.state.connected(now_ns):
             return Part(AUTOPILOT, PartState.READY)
         return Part(AUTOPILOT, PartState.MISSING, "its heartbeat is lost")
-
-
-def _of_camera(camera: WorkerCamera) -> Part:
-    supervisor = camera.supervisor
-    name = "camera" if camera.name is None else f"camera {camera.name}"
-    state = _OF_CAMERAS[supervisor.state]
-    reason = "" if state is PartState.READY else supervisor.problem
-    if state is PartState.FINISHED:
-        reason = "its source has ended"
-    return Part(name, state, reason, supervisor.next_try_ns)

@@ -149,7 +149,16 @@ class Publisher:
             self._bus.publish(topics.CAMERA_INFO, message, camera.name)
 
     def publish_preview(self, camera: WorkerCamera, preview: AnyPreview) -> None:
-        """Publish a point cloud, a depth image, or an image, which also answers the queries for one."""
+        """Publish a point cloud, a depth image, or an image, which also answers the queries for one.
+
+        Never raises: perception goes on.
+        """
+        try:
+            self._publish_preview(camera, preview)
+        except Exception:
+            logger.exception("a preview could not be published")
+
+    def _publish_preview(self, camera: WorkerCamera, preview: AnyPreview) -> None:
         if isinstance(preview, CloudPreview):
             about = cloud_attachment(
                 preview.sequence, preview.captured_ns, self._vehicle, camera.name, preview.points

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from companion.bus import topics
@@ -16,8 +17,8 @@ from companion.bus.listeners import Listener
 from companion.bus.messages import Localization
 from companion.bus.session import Bus
 from companion.bus.status_message import status_message
-from companion.guidance import grammar
 from companion.guidance.core import Guidance
+from companion.guidance.grammar import describe
 from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
@@ -34,7 +35,7 @@ from companion.service.publisher import Publisher
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
-from companion.tasks import run_until
+from companion.tasks import keep_running, run_until
 from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult
@@ -123,7 +124,7 @@ class Service:
         self._status: StatusBody | None = None
         self._stop = asyncio.Event()
 
-    async def run(self, ready: Callable[[], None] | None = None) -> None:
+    async def run(self, ready: Callable[[], object] = lambda: None) -> None:
         """Open the bus, call `ready`, start the parts, run until `stop()`; then let the autopilot hold.
 
         Raises:
@@ -134,7 +135,7 @@ class Service:
             self._tap.start()
             await self._run(ready)
 
-    async def _run(self, ready: Callable[[], None] | None) -> None:
+    async def _run(self, ready: Callable[[], object]) -> None:
         unsubscribe = self.driver.subscribe(self._on_state)
         tasks: list[asyncio.Task[None]] = []
         metrics: MetricsServer | None = None
@@ -143,18 +144,17 @@ class Service:
                 metrics = MetricsServer(self.settings.metrics.listen, lambda: self._status)
                 self._event("info", f"metrics on port {metrics.port}")
             await self.bus.start()
-            loops = [self._loop.run(), self.streamer.run(), self._publish_status(), self._health.run()]
-            publishing = self._publisher.publish_vehicle(self.guidance, self.streamer, self.cameras)
-            loops += [self.parts.run(), publishing]
+            loops = [self._loop.run(), self.streamer.run(), self.parts.run(), self._health.run()]
+            publish = partial(self._publisher.publish_vehicle, self.guidance, self.streamer, self.cameras)
+            loops.append(keep_running("status", self._publish_status, self._event))
+            loops.append(keep_running("vehicle messages", publish, self._event))
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
-                words = grammar.describe()
-                loops.append(run_console(self.command, self.stop, words, self._event, self._ask))
+                loops.append(run_console(self.command, self.stop, describe(), self._event, self._ask))
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")
             self.ready = True
-            if ready is not None:
-                ready()
+            ready()
             try:
                 await run_until(self._stop, tasks)
             finally:
@@ -218,8 +218,8 @@ class Service:
             self._status = status = self.status()
             self.bus.publish(topics.STATUS, status)
             self._publisher.publish_cameras(self.cameras)
-            mode, behaviour = status["vehicle"]["mode"], status["pilot"]["behaviour"]
-            self._notifier.status(self.parts.missing_text() or f"{mode}, {behaviour}")
+            flown = f"{self.driver.state.mode.value}, {self.guidance.status}"
+            self._notifier.status(self.parts.missing_text() or flown)
             await self._publisher.wait_status_due()
 
     def _on_state(self, state: VehicleState) -> None:

@@ -14,19 +14,27 @@ import struct
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from companion.clock import StandstillWatch
-from companion.tasks import spawn
+from companion.tasks import keep_running, spawn
 from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.autopilot_profile import POSITION_TARGET_ID, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.commander import NAME as COMMANDER_NAME
 from companion.vehicle.commander import ONBOARD_CONTROLLER, commander_mode, read_commander
 from companion.vehicle.connection_advice import no_answer_advice, no_autopilot_text, unsupported_autopilot
-from companion.vehicle.driver import CommandRefusedError, LinkError, NoAnswerError, OnBytes, SystemStatus
+from companion.vehicle.driver import (
+    CommandRefusedError,
+    LinkError,
+    LinkUnavailableError,
+    NoAnswerError,
+    OnBytes,
+    SystemStatus,
+)
 from companion.vehicle.flight_commands import FlightCommands
 from companion.vehicle.framing import CURRENT_MODE_ID, Frame, is_signed, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim, address_text
@@ -205,7 +213,7 @@ class AutopilotDriver(ABC):
             async with asyncio.timeout(open_s):
                 self._link = await open_link(self.url, self._received)
         except TimeoutError as error:
-            raise LinkError(f"{self.url}: could not be opened within {open_s:g} s") from error
+            raise LinkUnavailableError(f"{self.url}: could not be opened within {open_s:g} s") from error
         try:
             opened_s = time.monotonic()
             await self._first_heartbeat(timeout_s, on_wait)
@@ -252,15 +260,18 @@ class AutopilotDriver(ABC):
             "%s: connected to %s, system %s: %s driver", self.url, name, self._system_id, self.library
         )
         self._streams = StreamRequests(self.url, self._telemetry, self._command)
-        for loop, what in (
-            (self._supervise(self._streams), "supervisor"),
-            (self._streams.run(), "streams"),
-            (self._synchronise(), "clock"),
-            (self._keep_identified(), "identity"),
-            (self._gimbal_commands.run(), "gimbal"),
-            *([(self._reports.load_events(), "events")] if self._telemetry.profile.has_events else []),
-        ):
-            self._tasks.append(spawn(loop, f"{what} of {self.url}"))
+        loops: dict[str, Callable[[], Coroutine[Any, Any, None]]] = {
+            "supervisor": partial(self._supervise, self._streams),
+            "streams": self._streams.run,
+            "clock": self._synchronise,
+            "identity": self._keep_identified,
+            "gimbal": self._gimbal_commands.run,
+        }
+        if self._telemetry.profile.has_events:
+            loops["events"] = self._reports.load_events
+        for what, loop in loops.items():
+            name = f"{what} of {self.url}"
+            self._tasks.append(spawn(keep_running(name, loop), name))
 
     async def close(self) -> None:
         """See Driver."""
@@ -285,7 +296,7 @@ class AutopilotDriver(ABC):
                     if not await _wait_event(self._heartbeat_received, 1.0):
                         on_wait(self._no_autopilot(None))
         if not self._heartbeat_received.is_set():
-            raise LinkError(self._no_autopilot(timeout_s))
+            raise LinkUnavailableError(self._no_autopilot(timeout_s))
 
     def _no_autopilot(self, timeout_s: float | None) -> str:
         return no_autopilot_text(

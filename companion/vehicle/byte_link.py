@@ -19,8 +19,8 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from companion.clock import boottime_ns
-from companion.tasks import spawn
-from companion.vehicle.driver import LinkError
+from companion.tasks import keep_running, spawn
+from companion.vehicle.driver import LinkError, LinkUnavailableError
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 
 logger = logging.getLogger(__name__)
@@ -76,7 +76,9 @@ async def _resolve(url: LinkUrl, kind: socket.SocketKind) -> tuple[int, Any]:
     try:
         found = await asyncio.get_running_loop().getaddrinfo(*url.address, type=kind)
     except OSError as error:
-        raise LinkError(f"{url}: the host cannot be resolved: {error.strerror or error}") from error
+        raise LinkUnavailableError(
+            f"{url}: the host cannot be resolved: {error.strerror or error}"
+        ) from error
     # Autopilots and simulators listen on IPv4; "localhost" may name both.
     family, _, _, _, address = min(found, key=lambda entry: entry[0] != socket.AF_INET)
     return family, address
@@ -93,7 +95,7 @@ async def _open_udp(url: LinkUrl, received: Received) -> _UdpLink:
         return _UdpLink(url, endpoint, received, peer=address)
     except OSError as error:
         endpoint.close()
-        raise LinkError(_bind_error_text(url, error)) from error
+        raise LinkUnavailableError(_bind_error_text(url, error)) from error
 
 
 def _reason(error: OSError) -> str:
@@ -261,7 +263,8 @@ class _StreamLink:
     def _on_lost(self, reason: str) -> None:
         logger.error("%s: link lost: %s; reopening", self._url, reason)
         self._release()
-        self._reopening = spawn(self._reopen(), f"reopening of {self._url}")
+        name = f"reopening of {self._url}"
+        self._reopening = spawn(keep_running(name, self._reopen), name)
 
     async def _reopen(self) -> None:
         while self._descriptor < 0:
@@ -297,7 +300,7 @@ async def _open_tcp(url: LinkUrl) -> int:
         return endpoint.detach()
     except OSError as error:
         reason = _reason(error)
-        raise LinkError(
+        raise LinkUnavailableError(
             f"{url}: cannot connect: {reason}; check that a vehicle or a router listens there"
         ) from error
     finally:
@@ -322,7 +325,7 @@ async def _open_serial(url: LinkUrl) -> int:
         if descriptor >= 0:
             with contextlib.suppress(OSError):
                 os.close(descriptor)
-        raise LinkError(_serial_error_text(url, error)) from error
+        raise LinkUnavailableError(_serial_error_text(url, error)) from error
     return descriptor
 
 

@@ -11,6 +11,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from companion.clock import StandstillWatch
+from companion.passing import PassingError
 from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget
@@ -26,6 +27,10 @@ OnBytes = Callable[[bool, bytes], None]
 
 class LinkError(ConnectionError):
     """The link cannot be opened, or no autopilot answers on it. The message is one line."""
+
+
+class LinkUnavailableError(LinkError, PassingError):
+    """It cannot be opened now, or no autopilot answers now."""
 
 
 class CommandRefusedError(RuntimeError):

@@ -29,7 +29,7 @@ from mavsdk.plugins.mavlink_direct import (
 from mavsdk.plugins.param import Param, ParamError, ParamResult
 
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT, HEARTBEAT_ID, AutopilotDriver
-from companion.vehicle.driver import CommandRefusedError, LinkError
+from companion.vehicle.driver import CommandRefusedError, LinkUnavailableError
 from companion.vehicle.framing import Frame, frames_of, with_sequence
 from companion.vehicle.gimbal_telemetry import ATTITUDE_STATUS
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
@@ -78,7 +78,9 @@ class MavsdkDriver(AutopilotDriver):
             self._on_frames([self._newest_heartbeat])  # the next one may take a second
         system = await found
         if system is None:
-            raise LinkError(f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s")
+            raise LinkUnavailableError(
+                f"{self.url}: MAVSDK did not find the autopilot within {timeout_s:g} s"
+            )
         direct = MavlinkDirect(system)
         for name in _SUBSCRIBED:
             direct.subscribe_message(name, lambda message, _: self._hop(self._message, message))

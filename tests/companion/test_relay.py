@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion import relay as relay_module
 from companion.relay import Relay
-from companion.vehicle.driver import LinkError
+from companion.vehicle.driver import LinkError, LinkUnavailableError
 from mavlink_sim.testing import free_udp_ports
 
 pytestmark = pytest.mark.realtime
@@ -169,13 +169,19 @@ async def test_autopilot_back_on_another_port_is_answered(monkeypatch: pytest.Mo
         (heartbeat(vehicle_type=mavlink.MAV_TYPE_GROUND_ROVER), r"a rover \(MAV_TYPE 10\)"),
         (heartbeat(autopilot=mavlink.MAV_AUTOPILOT_GENERIC), "MAV_AUTOPILOT 0"),
         (heartbeat(armed=True), "armed"),
-        (b"", "no autopilot heartbeat"),
     ],
 )
 async def test_unfit_vehicle_is_refused_with_the_reason(sent: bytes, named: str) -> None:
     async with opened() as ends:
         ends.send(sent)
         with pytest.raises(ValueError, match=named):
+            await ends.relay.check_autopilot()
+
+
+async def test_missing_autopilot_may_come_later() -> None:
+    async with opened() as ends:
+        ends.send(b"")
+        with pytest.raises(LinkUnavailableError, match="no autopilot heartbeat"):
             await ends.relay.check_autopilot()
 
 

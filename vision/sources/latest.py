@@ -26,6 +26,7 @@ from vision.sources.capture import (
 from vision.sources.source import (
     CameraChangedError,
     EndOfStream,
+    NoFrameError,
     Source,
     SourceError,
     SourceSettings,
@@ -101,7 +102,7 @@ class LatestSource(Source):
             return
         self.close()
         if isinstance(end, EndOfStream):
-            raise SourceError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
+            raise NoFrameError(f"{self.uri}: ended before its first frame{f': {end}' if str(end) else ''}")
         if isinstance(end, SourceError) and not str(end).startswith(self.uri):
             raise type(end)(f"{self.uri}: {end}") from end
         raise end

@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import os
 import stat
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -130,6 +131,8 @@ def check_address(uri: str, settings: SourceSettings) -> None:
     """
     check_there(uri)
     scheme = uri.partition("://")[0] if "://" in uri else ""
+    if uri == "-" and sys.stdin is None:  # as Python shows a closed descriptor
+        raise SourceError("standard input is closed: expected a pipe or a file, such as `ffmpeg … | …`")
     if uri == "-" or camera_device(uri) is not None:
         return
     if scheme in ("", "file"):

@@ -10,6 +10,7 @@ from vision.frame import Frame
 from vision.sources.capture import CaptureError, MediaTime, OpenCapture, RawFrame, adapted, label
 from vision.sources.source import (
     EndOfStream,
+    NoFrameError,
     Source,
     SourceError,
     SourceSettings,
@@ -62,7 +63,7 @@ class SequentialSource(Source):
             while raw is None and time.monotonic() < deadline_s:
                 raw = self._capture.read(max(deadline_s - time.monotonic(), 0.0))
         except EndOfStream as end:
-            raise SourceError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
+            raise NoFrameError(f"{self.uri}: ended before its first frame{_detail(end)}") from end
         except CaptureError as lost:
             raise SourceUnavailableError(f"{self.uri}: {lost}") from lost
         if raw is None:

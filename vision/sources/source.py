@@ -32,6 +32,10 @@ class SourceUnavailableError(SourceError):
     """The source is not there now, or gives no frame. It may come: opening it again may succeed."""
 
 
+class NoFrameError(SourceError):
+    """The source has ended before its first frame."""
+
+
 class CameraChangedError(SourceError):
     """The source returned with another lens or mount; open it again to use that."""
 

@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 from companion.bus.topics import NO_OBJECTS, TOPICS
 from companion.cli import flags
 from companion.cli.commands import app
-from companion.cli.flags import EXIT_PASSING, warn_rendered_only
+from companion.cli.flags import warn_rendered_only
 from companion.guidance.command import COMMANDS
 from companion.settings import Settings
 from mavlink_sim.testing import free_port
@@ -190,21 +190,6 @@ def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     line = one_line_of_bad_input(companion_here("run", cwd=tmp_path))
     assert "detector.confidence" in line
     assert "0 to 1" in line
-
-
-@pytest.mark.parametrize("taken", ["--zenoh-listen", "--metrics-listen"])
-def test_taken_port_ends_run_with_a_code_for_another_try(taken: str, tmp_path: Path) -> None:
-    if taken == "--metrics-listen":
-        pytest.importorskip("prometheus_client", reason="prometheus_client is an optional extra")
-    with socket.create_server(("127.0.0.1", 0)) as other:
-        address = f"127.0.0.1:{other.getsockname()[1]}"
-        listen = {"--zenoh-listen": f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"}
-        listen |= {taken: f"tcp/{address}" if taken == "--zenoh-listen" else address}
-        words = [word for pair in listen.items() for word in pair]
-        done = companion("run", "--source", "none", "--vehicle-url", "none", *words, cwd=tmp_path)
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("companion:")]
-    assert done.returncode == EXIT_PASSING, done.stderr
-    assert address in line
 
 
 @pytest.mark.parametrize(

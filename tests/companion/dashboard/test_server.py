@@ -19,6 +19,7 @@ from companion.bus.topics import DETECTIONS, VEHICLE, command_key
 from companion.dashboard.access import COOKIE, DashboardError
 from companion.dashboard.connections import MAX_ANSWERED
 from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_STREAMS_PER_BROWSER
+from companion.passing import AddressTakenError
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
 
@@ -84,7 +85,7 @@ async def test_token_opens_the_page_and_sets_a_cookie(tmp_path: Path) -> None:
 
 async def test_address_in_use_or_open_without_token_is_refused() -> None:
     async with serving() as port:
-        with pytest.raises(DashboardError) as refused:
+        with pytest.raises(AddressTakenError) as refused:
             async with serving(port=port):
                 raise AssertionError
         assert str(port) in str(refused.value)

@@ -14,9 +14,10 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli import app
-from companion.cli.flags import EXIT_BAD_INPUT, EXIT_PASSING
+from companion.cli.flags import EXIT_BAD_INPUT
 from companion.cli.models import model_after_pull
 from companion.models.pull import PullError, at_address, pull
+from companion.passing import EXIT_PASSING
 from vision.catalog import CAMERA_MODEL, KNOWN, KnownModel, known_by_digest
 from vision.weights import DEFAULT_EXPORT
 from vision.yolo.checkpoint_pair import file_sha256

@@ -16,6 +16,7 @@ import pytest
 from companion.bus.client import listen
 from companion.operator.metrics import MetricsError, MetricsServer
 from companion.operator.wsgi_server import MAX_CONNECTIONS
+from companion.passing import AddressTakenError
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
 
@@ -89,7 +90,7 @@ def test_busy_metrics_address_is_reported() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         where = f"127.0.0.1:{taken.getsockname()[1]}"
-        with pytest.raises(MetricsError, match=f"{where}: .*in use"):
+        with pytest.raises(AddressTakenError, match=f"{where}: .*in use"):
             MetricsServer(where, lambda: None)
 
 

@@ -461,3 +461,15 @@ async def test_killed_worker_keeps_the_position_in_standard_input(monkeypatch: p
                 await until(lambda: supervisor.state is PerceptionState.FINISHED)
         finally:
             ended.set()
+
+
+async def test_worker_ended_by_another_program_is_replaced(photos: Path) -> None:
+    async with supervised(settings_of(photos)) as (supervisor, recorder):
+        await until(lambda: recorder.results)
+        first = supervisor.status.pid
+        assert first is not None
+        os.kill(first, signal.SIGTERM)  # as `kill`, or the kernel's memory guard
+        await until(lambda: supervisor.status.pid not in (None, first))
+        await until(lambda: supervisor.state is PerceptionState.RUNNING)
+        assert supervisor.problem == ""
+        assert recorder.has_event("lost", "signal")
