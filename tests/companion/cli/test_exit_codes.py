@@ -59,7 +59,6 @@ CASES = [
     ("demo --vehicle-url serial:///dev/ttyACM0:57600", WRONG, "udpin"),
     ("dashboard --listen 127.0.0.1:{tcp}", EXIT_PASSING, "{tcp}"),
     ("dashboard --listen nonsense", WRONG, "HOST:PORT"),
-    ("mcp --listen 127.0.0.1:{tcp} --token-file {token}", EXIT_PASSING, "{tcp}"),
     ("run --source - --detector-kind none-such {free}", WRONG, "none-such"),
 ]
 
@@ -71,14 +70,10 @@ def test_passing_failure_and_wrong_settings_differ(
     if "metrics" in command:
         pytest.importorskip("prometheus_client", reason="prometheus_client is an optional extra")
     (tmp_path / "photos").mkdir()
-    token = tmp_path / "token"
-    token.touch(0o600)
-    token.write_text(32 * "a")
     words = {
         "tcp": ports.tcp,
         "udp": ports.udp,
         "here": tmp_path / "photos",
-        "token": token,
         "free": f"--zenoh-listen tcp/127.0.0.1:{ports.free} --dashboard-listen=",
     }
     done = companion(*command.format(**words).split(), cwd=tmp_path)

@@ -473,3 +473,15 @@ async def test_worker_ended_by_another_program_is_replaced(photos: Path) -> None
         await until(lambda: supervisor.state is PerceptionState.RUNNING)
         assert supervisor.problem == ""
         assert recorder.has_event("lost", "signal")
+
+
+async def test_input_that_ends_before_a_frame_ends_perception_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading, writer = os.pipe()
+    settings = raw_settings(reading, monkeypatch)
+    os.close(writer)  # as by a program that has failed at its start
+    async with supervised(settings) as (supervisor, recorder):
+        await until(lambda: supervisor.state is PerceptionState.FAILED)
+        assert "before its first frame" in supervisor.problem
+        assert (supervisor.next_try_ns, supervisor.status.restarts) == (None, 0)
+        assert [level for level, _ in recorder.events] == ["error"]
+    os.close(reading)

@@ -49,6 +49,7 @@ from companion.perception.process import (
 from companion.perception.worker import ControlChannel, _heartbeat_while_loading, _work
 from companion.settings.reading import load_settings
 from vision.detections import Detections
+from vision.object_detector import DETECTORS, ObjectDetector
 from vision.pipeline import PerceptionResult
 
 pytestmark = pytest.mark.realtime
@@ -244,6 +245,34 @@ def test_failure_of_a_start_is_one_line(
     failed = _work(Begin(settings), control, Mock())
     assert isinstance(failed, StartFailed)
     assert re.search(named, failed.text)
+    assert "\n" not in failed.text
+
+
+@pytest.mark.parametrize(
+    ("error", "wrong"),
+    [
+        (ValueError("no such weights"), True),
+        (KeyError("weights"), False),
+        (ZeroDivisionError("of a plug-in"), False),
+        (MemoryError(), False),
+        (RuntimeError("two\nlines"), False),
+    ],
+)
+def test_only_a_wrong_setting_of_a_plug_in_ends_the_service(
+    error: Exception, wrong: bool, image_folder: Path
+) -> None:
+    def fail(_settings: object) -> ObjectDetector:
+        raise error
+
+    DETECTORS.add("odd", "raises", fail)
+    try:
+        values = {"source.uri": str(image_folder), "detector.kind": "odd"}
+        failed = _work(Begin(load_settings(os.devnull, values, {})), Mock(stopping=True), Mock())
+    finally:
+        DETECTORS.remove("odd")
+    assert isinstance(failed, StartFailed)
+    assert failed.wrong_settings is wrong
+    assert failed.text
     assert "\n" not in failed.text
 
 
