@@ -12,6 +12,7 @@ import re
 import sys
 from contextlib import suppress
 
+from companion.load import with_load
 from vision.redaction import redacted
 
 # syslog(3): LOG_ERR, LOG_WARNING, LOG_INFO, LOG_DEBUG; the first whose level is reached.
@@ -43,7 +44,10 @@ def marked_for_journal(text: str, level: int) -> str:
 
 
 class _Formatter(logging.Formatter):
-    """Without secrets, also in tracebacks."""
+    """Without secrets, also in tracebacks; with the load where something was too slow."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - of logging
+        return with_load(super().formatMessage(record))
 
     def format(self, record: logging.LogRecord) -> str:
         return redacted(super().format(record))

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-from companion.load import busy_text
 from companion.passing import PassingError
 from companion.relay import Relay
 from companion.service import Service
@@ -122,7 +121,7 @@ class SimProcess:
                 raise SimSessionError(f"the simulator did not start: {self._last_output()}")
         except TimeoutError as error:
             raise SimUnavailableError(
-                f"the simulator was not ready within {_SIMULATOR_START_S:g} s{busy_text()}"
+                f"the simulator was not ready within {_SIMULATOR_START_S:g} s"
             ) from error
         finally:
             lost.cancel()
@@ -350,8 +349,6 @@ async def until_ready_to_arm(service: Service) -> None:
         async with asyncio.timeout(_ARMABLE_S):
             await armable.wait()
     except TimeoutError as error:
-        raise SimUnavailableError(
-            f"the vehicle was not ready to arm within {_ARMABLE_S:g} s{busy_text()}"
-        ) from error
+        raise SimUnavailableError(f"the vehicle was not ready to arm within {_ARMABLE_S:g} s") from error
     finally:
         unsubscribe()

@@ -18,7 +18,7 @@ COMPANION_LAYERS = {
     "clock": 0,
     "config_check": 9,
     "geometry": 0,
-    "journal": 0,
+    "journal": 1,
     "key_files": 0,
     "peer_data": 0,
     "plugins": 0,

@@ -19,6 +19,7 @@ import typer.core
 import typer.main
 
 from companion.journal import marked_for_journal
+from companion.load import with_load
 from companion.passing import EXIT_PASSING, PassingError
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
@@ -123,7 +124,7 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         yield
     except printed as error:
         for line in str(error).splitlines():
-            typer.echo(redacted(f"companion: {line}"), err=True)
+            typer.echo(with_load(redacted(f"companion: {line}")), err=True)
         raise typer.Exit(EXIT_PASSING if isinstance(error, PassingError) else code) from error
 
 

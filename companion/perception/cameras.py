@@ -23,7 +23,7 @@ from companion.guidance.targets.from_detections import (
 from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
-from companion.load import busy_text
+from companion.load import with_load
 from companion.perception.messages import AnyPreview
 from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
@@ -237,7 +237,7 @@ class WorkerCamera(PerceptionCamera):
             return ""
         if not (why := super().blind(now_ns)):
             return ""
-        return f"{why}; {self.supervisor.problem}" if self.supervisor.problem else f"{why}{busy_text()}"
+        return with_load(f"{why}; {self.supervisor.problem}" if self.supervisor.problem else why)
 
     async def start(self) -> None:
         """Start the worker, as `PerceptionSupervisor.start`; the error has the camera's name."""

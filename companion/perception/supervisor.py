@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from companion.load import busy_text
+from companion.load import with_load
 from companion.passing import PassingError
 from companion.perception.messages import (
     AnyPreview,
@@ -341,7 +341,7 @@ class PerceptionSupervisor:
                 end = await self._run_one(started)
             except Exception as error:  # a fault of ours or of a callback: as that of a worker
                 end = _End(False, error_text(error))
-                if end.text != self._problem:
+                if not self._problem.startswith(end.text):
                     logger.exception("the supervision of a worker has failed")
             if self._stop_asked.is_set():
                 self._after_stop(end)
@@ -350,7 +350,7 @@ class PerceptionSupervisor:
                 self._state = PerceptionState.FINISHED
                 self._on_event("info", f"perception: {end.text}, after {self._before.frames} frames")
                 return
-            self._problem = end.text
+            self._problem = with_load(end.text)
             if end.wrong_settings and not started.done():
                 self._state = PerceptionState.FAILED
                 return
@@ -461,7 +461,7 @@ class PerceptionSupervisor:
             elif not self._stop_asked.is_set() and watchdog.silent_s(now_s) > watchdog.stuck_after_s:
                 assert self._process is not None
                 text = f"process {self._process.pid} is stuck: no message for"
-                return _End(False, f"{text} {watchdog.silent_s(now_s):.1f} s{busy_text()}")
+                return _End(False, f"{text} {watchdog.silent_s(now_s):.1f} s")
 
     async def _read(
         self, process: PerceptionProcess, watchdog: Watchdog, started: asyncio.Future[None]

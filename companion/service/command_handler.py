@@ -19,6 +19,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command import COMMANDS, GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.load import with_load
 from vision.tracking import Selected
 
 # Commands reported as events: so many a second, and so many at once, which is more than a person sends.
@@ -161,7 +162,8 @@ class CommandHandler:
         if self._reported.take():
             self._on_event("info" if answer.success else "warning", f"{command}: {answer.reason}")
         track = {"track": answer.track_id, "class": answer.class_name}
-        return {**self._ended(identifier, str(command), Outcome(answer.success, answer.reason)), **track}
+        outcome = Outcome(answer.success, with_load(answer.reason))
+        return {**self._ended(identifier, str(command), outcome), **track}
 
     def take_commands(self) -> tuple[CommandInput, ...]:
         """Return the commands received since the last call."""
@@ -170,6 +172,7 @@ class CommandHandler:
 
     def on_results(self, results: Sequence[CommandResult], endings: Sequence[CommandResult]) -> None:
         """Pass on what guidance has answered and ended in one step."""
+        results, endings = _with_load(results), _with_load(endings)
         ended = {ending.identifier for ending in endings}
         for result in results:
             if (command := self._open.get(result.identifier)) is None:
@@ -221,6 +224,14 @@ class CommandHandler:
                 "reason": "" if outcome is None else outcome.reason[:LONGEST_TEXT],
             }
         )
+
+
+def _with_load(results: Sequence[CommandResult]) -> list[CommandResult]:
+    """Results that are about slowness get the load here: replays compare what guidance itself gives."""
+    return [
+        replace(result, outcome=replace(result.outcome, reason=with_load(result.outcome.reason)))
+        for result in results
+    ]
 
 
 def _with_step(command: CommandInput, outcome: Outcome) -> Outcome:

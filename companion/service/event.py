@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.bodies.service import EventBody
+from companion.load import with_load
 from vision.redaction import redacted
 
 logger = logging.getLogger(__package__)
@@ -41,7 +42,7 @@ class EventLog:
 
     def add(self, level: str, text: str) -> None:
         """Add an event, without secrets. Never raises, whatever the listener does."""
-        text = redacted(text)
+        text = with_load(redacted(text))
         event = Event(time.monotonic_ns(), level, text)
         self.newest.append(event)
         logger.log(getattr(logging, level.upper()), "%s", text)
