@@ -155,7 +155,8 @@ class Drone(Commands):
         """Wait until a command has ended; returns its last message, with `success` and `reason`.
 
         An endless command ends when another one replaces it, by `stop`, or when the vehicle is flown by
-        something else: a pilot, a failsafe. Raises nothing for such an end.
+        something else: a pilot, a failsafe. Raises nothing for such an end. While the service is there and
+        silent, a warning in the log says so once, as it does for a command that waits.
 
         Args:
             reply: of the command, as its method has returned it.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from collections import OrderedDict
 from contextlib import suppress
 from typing import cast
@@ -11,10 +12,12 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.bodies.service import CommandStateBody
-from companion.bus.client import LastStatus, NoAnswerError, subscribe_kept
+from companion.bus.client import SILENT_S, LastStatus, NoAnswerError, subscribe_kept
 from companion.peer_data import PeerDataError, copy_payload, parse_object
 
 _KEPT = 1000
+
+logger = logging.getLogger(__name__)
 
 
 class Endings:
@@ -43,7 +46,15 @@ class Endings:
         if self._gone:
             raise self._no_answer(identifier)
         waiting = self._waiting.setdefault(identifier, self._loop.create_future())
-        return await asyncio.shield(waiting)
+        reported = False
+        while not waiting.done():
+            # Until the status may be silent, or, before the first one has come, it is looked again.
+            look_s = None if reported else max(SILENT_S - self._status.silent_s, 0.0) + 0.1
+            await asyncio.wait({waiting}, timeout=look_s)
+            if not reported and self._status.silent_s > SILENT_S:
+                reported = True
+                logger.warning("command %s: %s", identifier, self._status.silent_text())
+        return waiting.result()
 
     def _no_answer(self, identifier: str) -> NoAnswerError:
         return NoAnswerError(f"command {identifier}: {self._status.gone_text('its end')}")

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any, Literal
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -350,6 +351,15 @@ async def test_silent_service_is_reported_once_and_waited_for(monkeypatch: pytes
         await bus.close()
     assert reported.empty()
     assert "PX4 holds its position" in received[0]
+
+
+def test_connection_to_a_stopped_process_is_closed_quietly(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = Mock()
+    session.close.side_effect = zenoh.ZError("close operation timed out!")
+    monkeypatch.setattr("companion.bus.client._open", lambda *_: session)
+    with pytest.raises(NoAnswerError), open_client(ZenohSection()):
+        raise NoAnswerError("the service is silent")
+    session.close.assert_called_once()
 
 
 async def test_unknown_vehicle_has_no_service() -> None:

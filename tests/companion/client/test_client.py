@@ -356,6 +356,24 @@ async def test_waiting_for_an_end_fails_with_the_service() -> None:
 
 
 @pytest.mark.realtime
+async def test_silent_service_is_reported_while_an_end_is_awaited(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("companion.client.endings.SILENT_S", 0.2)
+    async with connected() as (there, drone):
+        there.bus.publish(topics.STATUS, {"vehicle": {"without_service": "PX4 holds its position"}})
+        reply = await drone.takeoff(3)
+        waiting = asyncio.create_task(drone.ended(reply))
+        await until(lambda: caplog.records)
+        assert not waiting.done()
+        there.end(1, "the pilot took over")  # it has only been slow
+        assert (await asyncio.wait_for(waiting, 20.0))["reason"] == "the pilot took over"
+    (record,) = caplog.records
+    assert (record.levelname, record.name) == ("WARNING", "companion.client.endings")
+    assert "PX4 holds its position" in record.getMessage()
+
+
+@pytest.mark.realtime
 async def test_refused_steering_sends_nothing_and_source_stays() -> None:
     async with connected() as (there, drone):
         there.refused = {"velocity"}
