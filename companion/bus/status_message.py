@@ -58,6 +58,7 @@ def status_message(
             same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
     state, limits, received = driver.state, guidance.limits, driver.reception
+    seeing = not steering.overdue(now_ns)
     has_vehicle = any(part["name"] == "autopilot" for part in parts)
     silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
     return {
@@ -117,8 +118,8 @@ def status_message(
         "cameras": {camera.name: _camera(camera.supervisor) for camera in cameras if camera.name},
         "targets": {
             "camera": steering.name,
-            "count": len(steering.targets),
-            "localization_error": steering.localization_error,
+            "count": len(steering.targets) if seeing else 0,
+            "localization_error": steering.localization_error if seeing else "",
         },
         "gimbal": _gimbal(guidance.gimbal, now_ns, state),
         "neighbours": {
@@ -203,7 +204,7 @@ def _gimbal(controller: GimbalController, now_ns: int, state: VehicleState) -> S
     gimbal = state.gimbal
     if gimbal is None and not controller.mounting.carries_camera:
         return None
-    pitch_rad = None if gimbal is None else gimbal.pitch_rad
+    pitch_rad = gimbal.pitch_rad if gimbal is not None and gimbal.attitude_fresh(now_ns) else None
     primary = None if gimbal is None else gimbal.primary_control
     return {
         "answers": gimbal is not None,

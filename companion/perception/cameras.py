@@ -110,6 +110,10 @@ class PerceptionCamera:
         return f"camera frozen: the same {self._repeated} for {age_s:.1f} s"
 
     def blind(self, now_ns: int) -> str:
+        """Why it does not see as expected, in words; empty: it does."""
+        return self.overdue(now_ns)
+
+    def overdue(self, now_ns: int) -> str:
         """Why results do not arrive as expected, in words; empty: they do. Each is of a frame."""
         what = "result" if self.settings.detector.enabled else "frame"
         age_s = self.age_s(now_ns)
@@ -235,7 +239,7 @@ class WorkerCamera(PerceptionCamera):
     def blind(self, now_ns: int) -> str:
         if self.settings.source.uri == NO_SOURCE or self.supervisor.state is PerceptionState.FINISHED:
             return ""
-        if not (why := super().blind(now_ns)):
+        if not (why := self.overdue(now_ns)):
             return ""
         return with_load(f"{why}; {self.supervisor.problem}" if self.supervisor.problem else why)
 

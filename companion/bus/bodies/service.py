@@ -225,9 +225,9 @@ class StatusTargetsBody(TypedDict):
     camera: str | None
     """the steering camera; null: the first"""
     count: int
-    """number of objects in its newest frame"""
+    """number of objects in its newest frame; 0 while frames do not arrive"""
     localization_error: str
-    """why detections have no direction; empty if they have"""
+    """why detections have no direction; empty if they have, or if there are none"""
 
 
 class StatusGimbalBody(TypedDict):
@@ -236,7 +236,7 @@ class StatusGimbalBody(TypedDict):
     answers: bool
     """a gimbal was received"""
     pitch_deg: float | None
-    """above the horizon"""
+    """above the horizon; null while it is not reported"""
     primary_control: str | None
     """MAVLink address with primary control"""
     ours: bool

@@ -11,6 +11,7 @@ import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import zenoh
@@ -235,6 +236,16 @@ def test_part_absent_for_ten_minutes(
                 await until(lambda: states(service)[absent] == "ready", 45.0)
 
     run_simulated(monkeypatch, clock, work())
+
+
+async def test_targets_of_a_camera_that_is_gone_are_not_shown() -> None:
+    service = service_of(vehicle__url="none")
+    (camera,) = service.cameras
+    camera.targets, camera.localization_error = (Mock(), Mock()), "no attitude"
+    camera.seen_ns = time.monotonic_ns()
+    assert service.status()["targets"] == {"camera": None, "count": 2, "localization_error": "no attitude"}
+    camera.seen_ns -= 5_000_000_000
+    assert service.status()["targets"] == {"camera": None, "count": 0, "localization_error": ""}
 
 
 async def test_recorder_is_a_part_that_waits_for_its_folder(tmp_path: Path) -> None:
