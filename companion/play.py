@@ -6,7 +6,7 @@ import asyncio
 import os
 import socket
 from collections.abc import Callable
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,6 +37,7 @@ Say = Callable[[str], None]
 
 _GCS_PORT = 14550  # where ground stations listen
 _TCP = "tcp/"
+_PAGE_S = 10.0  # the page's address is waited for
 _CAMERA_RATE_HZ = 20.0
 """Frames a second of all cameras together, for two cores that also detect objects in them."""
 _MAX_CAMERAS = 4
@@ -89,7 +90,20 @@ def play(settings: Settings, options: PlayOptions, say: Say) -> None:
         scene = scene_or_demo(options.scene, options.seed)
     except SceneError as error:
         raise SimSessionError(str(error)) from error
+    say(_starting_text(options))
     asyncio.run(_play(settings, options, scene, say))
+
+
+def _starting_text(options: PlayOptions) -> str:
+    """What is started, in one line: it takes seconds."""
+    if options.vehicle_url is not None:
+        starting = ["a rendered camera"]
+    else:
+        several = options.vehicles > 1
+        starting = [f"{options.vehicles} simulated vehicles" if several else "the simulated vehicle"]
+        if options.cameras:
+            starting.append("a camera each" if options.cameras > 1 else "a camera")
+    return f"starting {', '.join(starting)} and the service"
 
 
 def _check_zenoh_ports(settings: Settings) -> None:
@@ -132,33 +146,41 @@ async def _until_stopped(
 ) -> None:
     async with _opened(options, scene) as vehicle:
         services = _services(settings, options, vehicle, say)
-        ready = False
+        ready, page_said = False, asyncio.Event()
+
+        def say_page(line: str) -> None:
+            say(line)
+            page_said.set()
 
         async def work() -> None:
             nonlocal ready
             await vehicle.until_ready()
             ready = True
+            if settings.dashboard.listen:  # its address stands above what to do next
+                with suppress(TimeoutError):
+                    async with asyncio.timeout(_PAGE_S):
+                        await page_said.wait()
             _print_next_commands(services, options.cameras, scene, say)
-            async with dashboard_process(services[0].settings, say):
-                if terminal_is_free(settings.source.uri):
-                    await run_console(
-                        _commands_of(services),
-                        stop.set,
-                        grammar.describe(),
-                        lambda level, text: say(text),
-                        AskProcess(services[0].settings),
-                    )
-                await stop.wait()
+            if terminal_is_free(settings.source.uri):
+                await run_console(
+                    _commands_of(services),
+                    stop.set,
+                    grammar.describe(),
+                    lambda level, text: say(text),
+                    AskProcess(services[0].settings),
+                )
+            await stop.wait()
 
-        running = asyncio.create_task(with_services(services, work))
-        lost = asyncio.create_task(vehicle.until_lost())
-        try:
-            await asyncio.wait({running, lost}, return_when=asyncio.FIRST_COMPLETED)
-        finally:
-            # The services end first: they switch a flying vehicle to hold.
-            running.cancel()
-            lost.cancel()
-            service_end, loss = await asyncio.gather(running, lost, return_exceptions=True)
+        async with dashboard_process(services[0].settings, say_page):
+            running = asyncio.create_task(with_services(services, work))
+            lost = asyncio.create_task(vehicle.until_lost())
+            try:
+                await asyncio.wait({running, lost}, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                # The services end first: they switch a flying vehicle to hold.
+                running.cancel()
+                lost.cancel()
+                service_end, loss = await asyncio.gather(running, lost, return_exceptions=True)
         if isinstance(loss, SimSessionError):
             raise SimulationLostError(str(loss)) if ready else loss
         if isinstance(service_end, Exception):

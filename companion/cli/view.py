@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import sys
@@ -60,6 +61,7 @@ def _refused(settings: Settings, given: Mapping[str, str], *, is_none: bool) -> 
 
 def _open_page(line: str) -> None:
     """Open the page's address where there is a display; without one it was only printed."""
+    logging.getLogger("companion").info("Ctrl-C ends it")
     has_display = sys.platform == "darwin" or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
     if has_display and (address := re.search(r"http://\S+", line)) is not None:
         # It may wait for the browser.

@@ -113,7 +113,12 @@ def test_play_flies_an_autopilot_at_a_url_and_ends_on_ctrl_c(tmp_path: Path, sma
     with ExitStack() as stack:
         simulator = stack.enter_context(running_simulator(system_id=7, **TWICE))
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
-        running = stack.enter_context(playing(tmp_path, "--vehicle-url", url, *small, quick=False))
+        page = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
+        flags = ("--vehicle-url", url, "--dashboard-listen", page)
+        running = stack.enter_context(playing(tmp_path, *flags, *small, quick=False))
+        assert "starting a rendered camera and the service" in running.lines[0]
+        assert any(f"http://{page}/" in line for line in running.lines)  # above what to do next
+        assert running.lines[-1].endswith(READY)
         assert any(line.endswith(": boat, car") for line in running.lines)
         running.take_off(2.0)
         assert any("armed" in event for event in simulator.events)
