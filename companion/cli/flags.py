@@ -49,6 +49,9 @@ SHORT_NAMES = {
     "log.level": "--log-level",
 }
 
+# The service alone does this; a command that takes the section `source` to read it must not accept it.
+_OF_THE_SERVICE = {"source.share"}
+
 # click's UsageError, through its public subclass: some versions of typer include their own click
 _UsageError: Any = typer.BadParameter.__base__
 
@@ -275,7 +278,14 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     known = {name for flag in flags() for name in (flag.key, flag.key.partition(".")[0])}
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
-    chosen = [flag for flag in flags() if not keys or {flag.key, flag.key.partition(".")[0]} & set(keys)]
+    wanted = set(keys)
+    chosen = [
+        flag
+        for flag in flags()
+        if not keys
+        or flag.key in wanted
+        or (flag.key.partition(".")[0] in wanted and flag.key not in _OF_THE_SERVICE)
+    ]
     # Former names are hidden flags: using one is reported with all other errors of the settings.
     former = [
         Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
