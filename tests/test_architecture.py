@@ -160,6 +160,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.frame",
     "vision.geolocation",
     "vision.gc_pause",
+    "vision.marker_dictionaries",
     "vision.rotation",
     "vision.shared_frame",
     "vision.text_file",

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.camera_model import MIN_COSINE, CameraModel
+from vision.marker_dictionaries import dictionary_named, opencv_dictionary
 from vision.marker_edges import CORNER_SIGMA_PX, corners_on_edges
 
 # A false detection, or corners displaced by blur, fits no pose: largest RMS over the corners, as a share of
@@ -30,16 +31,6 @@ SAME_RAD, _MAX_STEPS = 0.005, 8
 # Whose print a marker is: its upper edge differs. The images that AprilRobotics publishes are those of
 # OpenCV's dictionaries turned by 180 degrees: all four families, compared with the codes of its library.
 PRINTS = ("opencv", "apriltag")
-# OpenCV has two spellings of some names; the usual one is offered.
-DICTIONARIES = tuple(
-    sorted(
-        name.removeprefix("DICT_")
-        for name in dir(cv2.aruco)
-        if name.startswith("DICT_")
-        and not (name.startswith("DICT_APRILTAG") and "H" in name)
-        and not name.endswith("36H12")
-    )
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +38,7 @@ class MarkerKind:
     """Dictionary and sizes of the markers to detect.
 
     Attributes:
-        dictionary: one of DICTIONARIES: "4X4_50", "APRILTAG_36h11".
+        dictionary: one of DICTIONARIES, "4X4_50", "APRILTAG_36h11"; given by any name of `dictionary_named`.
         size_m: side of the black square, metres.
         sizes_m: size per id, for ids with another size.
         print: one of PRINTS: whose print the markers are. prints: the same per id, for others.
@@ -64,6 +55,7 @@ class MarkerKind:
     prints: Mapping[int, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "dictionary", dictionary_named(self.dictionary))
         count = markers_in(self.dictionary)
         for identifier in (*self.sizes_m, *self.prints):
             if not 0 <= identifier < count:
@@ -171,12 +163,12 @@ class Marker:
 
 def markers_in(dictionary: str) -> int:
     """Number of markers in a dictionary. Raises ValueError, listing the known dictionaries."""
-    return len(_dictionary(dictionary).bytesList)
+    return len(opencv_dictionary(dictionary).bytesList)
 
 
 def is_apriltag(dictionary: str) -> bool:
-    """Whether a dictionary is one of AprilTag's families."""
-    return dictionary.startswith("APRILTAG_")
+    """Whether a dictionary is one of AprilTag's families. Raises ValueError: no such dictionary."""
+    return dictionary_named(dictionary).startswith("APRILTAG_")
 
 
 def marker_modules(kind: MarkerKind, identifier: int) -> NDArray[np.bool_]:
@@ -188,7 +180,7 @@ def marker_modules(kind: MarkerKind, identifier: int) -> NDArray[np.bool_]:
     count = markers_in(kind.dictionary)
     if not 0 <= identifier < count:
         raise ValueError(f"marker id {identifier} is not in dictionary {kind.dictionary} (0 to {count - 1})")
-    dictionary = _dictionary(kind.dictionary)
+    dictionary = opencv_dictionary(kind.dictionary)
     image = cv2.aruco.generateImageMarker(dictionary, identifier, dictionary.markerSize + 2)
     black = np.asarray(image) < 128
     return np.rot90(black, 2) if kind.turned(identifier) else black
@@ -201,7 +193,7 @@ class MarkerDetector:
         self.kind = kind
         parameters = cv2.aruco.DetectorParameters()
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-        dictionary = _dictionary(kind.dictionary)
+        dictionary = opencv_dictionary(kind.dictionary)
         # With the border of one module.
         self._modules = dictionary.markerSize + 2
         self._detector = cv2.aruco.ArucoDetector(dictionary, parameters)
@@ -479,9 +471,3 @@ def square(size_m: float) -> NDArray[np.float64]:
     """(4, 3) corners of a marker of side `size_m` in its frame, metres: upper left, then clockwise."""
     half = size_m / 2
     return np.array([[-half, half, 0.0], [half, half, 0.0], [half, -half, 0.0], [-half, -half, 0.0]])
-
-
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    if name not in DICTIONARIES:
-        raise ValueError(f"unknown marker dictionary {name!r}; known: {', '.join(DICTIONARIES)}")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))

@@ -25,7 +25,7 @@ markers = typer.Typer(
     no_args_is_help=True,
 )
 _DICTIONARY = Annotated[
-    str | None, typer.Option(help="OpenCV's dictionary: APRILTAG_36h11. Default: markers.dictionary.")
+    str | None, typer.Option(help="Dictionary: 4X4_50, tag36h11. Default: markers.dictionary.")
 ]
 _SIZE = Annotated[
     float | None, typer.Option(help="Side of the black square, metres. Default: markers.size_m.")
@@ -111,7 +111,9 @@ def print(
 
 def _section(section: MarkersSection, dictionary: str | None, size_m: float | None) -> MarkersSection:
     """The settings with the options. Raises ValueError."""
-    given = {"dictionary": dictionary, "size_m": size_m}
+    from vision.marker_dictionaries import dictionary_named
+
+    given = {"dictionary": dictionary and dictionary_named(dictionary), "size_m": size_m}
     section = section.model_copy(update={key: value for key, value in given.items() if value is not None})
     if section.kind() is None:
         raise ValueError(

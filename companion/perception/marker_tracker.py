@@ -271,7 +271,8 @@ class MarkerTracker:
 
 def _cause(camera: PerceptionCamera, printed: str, checked: str, turned: bool) -> str:
     """The likely cause of a contradiction. `turned`: as if the prints were turned by 180 degrees."""
-    if not turned or not is_apriltag(camera.settings.markers.dictionary or ""):
+    dictionary = camera.settings.markers.dictionary
+    if not turned or dictionary is None or not is_apriltag(dictionary):
         return f"check {checked}"
     other = "apriltag" if printed == "opencv" else "opencv"
     return (

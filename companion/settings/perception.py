@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from companion.settings.marker_files import Print, read_boards, read_map
 from companion.settings.section import Section
@@ -26,6 +26,7 @@ from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.home import expanded
 from vision.marker_boards import Board
+from vision.marker_dictionaries import dictionary_named
 from vision.markers import MarkerKind, PadMarker, markers_in
 from vision.object_detector import YOLO, DetectorSettings
 from vision.sources.source import SourceSettings
@@ -407,8 +408,8 @@ class TrackerSection(Section):
 class MarkersSection(Section):
     """Detection of printed markers (ArUco, AprilTag), to land on."""
 
-    dictionary: str | None = None
-    """OpenCV's dictionary name without DICT_: APRILTAG_36h11, 4X4_50; unset: no marker detection"""
+    dictionary: Annotated[str | None, AfterValidator(lambda name: name and dictionary_named(name))] = None
+    """OpenCV's dictionary (4X4_50, APRILTAG_36h11), or AprilTag's (tag36h11); unset: no marker detection"""
     size_m: Annotated[float, Field(ge=0.01, le=50)] = 0.5
     """side of a marker's black square, metres"""
     print: Print = "opencv"

@@ -278,6 +278,8 @@ class _Reading:
             suffix = f" ({', '.join(sorted(origins))})" if table else ""
             return f"{table}{': ' if table else ''}{details['ctx']['error']}{suffix}"
         key = f"{table}.{rest[0]}"
+        if details["type"] == "value_error":  # a rule of the value's own
+            return f"{key}: {details['ctx']['error']} ({self._origins[key]})"
         value = shown(self._values[table][rest[0]])
         section = section_of(table)
         assert section is not None

@@ -21,7 +21,7 @@ from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.lens import Lens, Shutter
 from mavlink_sim.camera.scene import CameraSettings, Path, Scene
-from mavlink_sim.world.fiducials import DICTIONARIES, Print
+from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.textures import KINDS
 from mavlink_sim.world.world import (
     OBJECT_NAMES,
@@ -35,6 +35,7 @@ from mavlink_sim.world.world import (
     demo_world,
 )
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
+from vision.marker_dictionaries import dictionary_named
 from vision.text_file import read_text
 
 
@@ -127,7 +128,7 @@ class _Object(_Table):
 
 
 class _Plate(_Table):
-    dictionary: Annotated[str, _one_of(DICTIONARIES)] = "4X4_50"
+    dictionary: Annotated[str, AfterValidator(dictionary_named)] = "4X4_50"
     id: Annotated[int, Field(ge=0)]
     size_m: Annotated[Number, Field(ge=0.01, le=50)]
     place_m: Coordinates | None = None

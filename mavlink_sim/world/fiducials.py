@@ -16,16 +16,8 @@ from numpy.typing import NDArray
 
 from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.textures import Plane
+from vision.marker_dictionaries import dictionary_named, opencv_dictionary
 
-DICTIONARIES = tuple(
-    sorted(
-        name.removeprefix("DICT_")
-        for name in dir(cv2.aruco)
-        if name.startswith("DICT_") and not (name.startswith("DICT_APRILTAG") and "H" in name)
-        and not name.endswith("36H12")
-    )
-)  # fmt: skip
-"""OpenCV's names without their prefix; of two spellings the usual one."""
 QUIET_CELLS = 1
 """White cells around the black square: a detector needs them."""
 BLACK = 0.07
@@ -38,7 +30,7 @@ class Print:
     """The print on a plate.
 
     Attributes:
-        dictionary: one of DICTIONARIES, "4X4_50" or "APRILTAG_36h11".
+        dictionary: "4X4_50" or "APRILTAG_36h11"; given by any name of `dictionary_named`.
         identifier: of the marker in its dictionary.
         size_m: side of the marker's black square.
         standing: on its lower edge, its front along the yaw; else lying face up, its upper edge along it.
@@ -53,11 +45,8 @@ class Print:
     standing: bool = False
 
     def __post_init__(self) -> None:
-        if self.dictionary not in DICTIONARIES:
-            raise ValueError(
-                f"unknown marker dictionary {self.dictionary!r}; known are {', '.join(DICTIONARIES)}"
-            )
-        count = len(_dictionary(self.dictionary).bytesList)
+        object.__setattr__(self, "dictionary", dictionary_named(self.dictionary))
+        count = len(opencv_dictionary(self.dictionary).bytesList)
         if not 0 <= self.identifier < count:
             raise ValueError(
                 f"marker {self.identifier} is not in dictionary {self.dictionary}, which has 0 to {count - 1}"
@@ -68,7 +57,7 @@ class Print:
     @property
     def board_side_m(self) -> float:
         """Side of the plate: the marker with its white margin."""
-        cells = _dictionary(self.dictionary).markerSize + 2
+        cells = opencv_dictionary(self.dictionary).markerSize + 2
         return self.size_m * (cells + 2 * QUIET_CELLS) / cells
 
     @property
@@ -78,14 +67,10 @@ class Print:
         return (PLATE_THICKNESS_M, side, side) if self.standing else (side, side, PLATE_THICKNESS_M)
 
 
-def _dictionary(name: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-
-
 @lru_cache(maxsize=256)
 def marker_cells(dictionary: str, identifier: int) -> Plane:
     """(N, N) float32 reflectance of the plate's cells, margin included, as seen upright."""
-    book = _dictionary(dictionary)
+    book = opencv_dictionary(dictionary)
     cells = book.markerSize + 2
     image = cv2.aruco.generateImageMarker(book, identifier, cells, borderBits=1)
     whole = np.pad(np.asarray(image), QUIET_CELLS, constant_values=255)

@@ -147,7 +147,7 @@ def test_an_empty_file_is_an_empty_field_with_the_usual_camera() -> None:
             r"objects\[0\].path.speed_mps: .*0, got 0",
         ),
         ("[[plates]]\nid = 50\nsize_m = 1\nplace_m = [0, 0]", r"plates\[0\]: marker 50"),
-        ("[[plates]]\ndictionary = '4x4_50'\nid = 1\nsize_m = 1\nplace_m = [0, 0]", r"4X4_50"),
+        ("[[plates]]\ndictionary = '4x4'\nid = 1\nsize_m = 1\nplace_m = [0, 0]", r"4X4_50"),
     ],
 )
 def test_invalid_scenes_explained(text: str, message: str) -> None:

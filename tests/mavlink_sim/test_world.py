@@ -14,11 +14,12 @@ from hypothesis import strategies as st
 from mavlink_sim.camera.object_view import palette_of
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.depth_sort import clip_polygon, depth_sort_tree
-from mavlink_sim.world.fiducials import DICTIONARIES, Print, marker_cells
+from mavlink_sim.world.fiducials import Print, marker_cells
 from mavlink_sim.world.shapes import BUILDERS, CLASS_NAMES, VARIANTS, shape_of, variant_of
 from mavlink_sim.world.solids import Body, ground_shadows
 from mavlink_sim.world.world import Ground, Light, World, WorldObject, demo_world, range_to
 from vision.camera_model import CameraModel, CameraMount
+from vision.marker_dictionaries import DICTIONARIES
 from vision.rotation import matrix_from_euler
 
 SEEDS = range(12)

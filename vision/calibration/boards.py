@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from vision.markers import DICTIONARIES, markers_in
+from vision.marker_dictionaries import dictionary_named, lengths_of, opencv_dictionary
+from vision.markers import markers_in
 
 KINDS = ("chessboard", "charuco")
 # Fewest corners of a partly visible ChArUco board, of the share of all.
@@ -50,8 +51,8 @@ class Board:
         kind: "chessboard" or "charuco".
         columns, rows: inner corners of a chessboard, squares of a ChArUco board, as OpenCV counts them.
         square_m: side of a square, metres.
-        marker_m, dictionary: of a ChArUco board: side of a marker's black square, and OpenCV's name of the
-            dictionary without DICT_ ("4X4_50").
+        marker_m, dictionary: of a ChArUco board: side of a marker's black square, and the name of the
+            dictionary ("4X4_50"). A family (calib.io's "DICT_4X4") is its shortest with enough markers.
 
     Raises:
         ValueError: the kind, a size or the dictionary is invalid, or the dictionary has too few markers.
@@ -82,9 +83,10 @@ class Board:
                 f"the markers' side must be above 0 and below the squares' {self.square_m:g} m, "
                 f"got {self.marker_m:g}"
             )
-        if self.dictionary not in DICTIONARIES:
-            raise ValueError(f"unknown dictionary {self.dictionary!r}; known: {', '.join(DICTIONARIES)}")
-        if (wanted := self.columns * self.rows // 2) > (count := markers_in(self.dictionary)):
+        wanted = self.columns * self.rows // 2
+        enough = (name for name in lengths_of(self.dictionary) if markers_in(name) >= wanted)
+        object.__setattr__(self, "dictionary", next(enough, None) or dictionary_named(self.dictionary))
+        if wanted > (count := markers_in(self.dictionary)):
             raise ValueError(
                 f"a charuco board of {self.columns}x{self.rows} squares has {wanted} markers, dictionary "
                 f"{self.dictionary} has {count}"
@@ -173,7 +175,8 @@ class Board:
     @cached_property
     def _opencv(self) -> cv2.aruco.CharucoBoard:
         assert self.marker_m is not None
-        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
+        assert self.dictionary is not None
+        dictionary = opencv_dictionary(self.dictionary)
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square_m, self.marker_m, dictionary)
 
     @cached_property
