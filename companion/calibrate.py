@@ -6,6 +6,7 @@ import html
 import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,6 +20,7 @@ from vision.attitude import euler_from_quaternion
 from vision.calibration.boards import Board, BoardView
 from vision.calibration.calibrate import CalibrationError, CalibrationResult
 from vision.calibration.extrinsics import Extrinsics
+from vision.calibration.seen_boards import FAMILIES, SeenBoard, contradiction, described, seen_board
 from vision.calibration.views import EDGES, ViewCollector
 from vision.camera_model import CameraModel, pixels_without_rays, scaled_to_frames
 from vision.frame import Frame
@@ -32,6 +34,8 @@ Image = NDArray[np.uint8]
 Tilt = tuple[float, float]
 """Roll and pitch of the vehicle, radians."""
 
+# Images whose board is compared with the given one; of a live source without it, at each so many frames.
+_LOOKED_AT, _LIVE_LOOK = 5, 30
 # Images of the report are at most so wide.
 _WIDTH = 640
 # A live source without the marker gives a line each so many seconds.
@@ -50,6 +54,8 @@ class Collected:
         frames, found: numbers of processed frames, and of those with the board.
         images: name → the view's image, small, as JPEG.
         others: name → the second camera's view at the same time.
+        legacy: number of frames whose ChArUco board is as OpenCV drew them before 4.6.
+        without: the last images without the board. boards: the ChArUco boards that were seen.
     """
 
     collector: ViewCollector
@@ -57,6 +63,9 @@ class Collected:
     found: int = 0
     images: dict[str, bytes] = field(default_factory=dict)
     others: dict[str, BoardView] = field(default_factory=dict)
+    legacy: int = 0
+    without: deque[Image] = field(default_factory=lambda: deque(maxlen=_LOOKED_AT))
+    boards: list[SeenBoard] = field(default_factory=list)
 
     @property
     def pairs(self) -> list[tuple[BoardView, BoardView]]:
@@ -78,20 +87,22 @@ def collect_views(
         second: another camera: both must see the board at the same time.
 
     Raises:
-        CalibrationError: no frame shows the board.
+        CalibrationError: no frame shows the board, or it is another one than the given one.
         ValueError: the images differ in size, or one source is live and the other is not.
     """
     collected = Collected(ViewCollector(board, whole_image=second is None))
     folder = Path(source.uri)
     names = [path.name for path in images_in(folder)] if folder.is_dir() else []
     if source.live:
-        write(f"show {_described(board)} to the camera; Ctrl-C ends")
+        write(f"show {described(board)} to the camera; Ctrl-C ends")
     try:
         for frame, other in ((each, None) for each in source) if second is None else _pairs(source, second):
             if frame.sequence % every and not source.live:
                 continue
             name = names[frame.sequence] if frame.sequence < len(names) else f"frame {frame.sequence}"
             new = _process(frame, other, name, board, collected)
+            if source.live and not collected.found and collected.frames % _LIVE_LOOK == 0:
+                _check_board(collected, board)
             if new and source.live:
                 missing = collected.collector.missing()
                 views = len(collected.collector.views)
@@ -101,10 +112,11 @@ def collect_views(
     except KeyboardInterrupt:
         if not source.live:
             raise
+    _check_board(collected, board)
     if not collected.collector.views:
         images = "images" if second is None else f"pairs of images with {second.uri}"
         raise CalibrationError(
-            f"{source.uri}: no board in any of {collected.frames} {images}; looked for {_described(board)}"
+            f"{source.uri}: no board in any of {collected.frames} {images}; looked for {described(board)}"
         )
     return collected
 
@@ -223,8 +235,14 @@ def _process(frame: Frame, other: Frame | None, name: str, board: Board, collect
     view = board.detect(frame.image, name)
     second = None if view is None or other is None else board.detect(other.image, name)
     if view is None or (other is not None and second is None):
+        grey = frame.image if frame.image.ndim == 2 else cv2.cvtColor(frame.image, cv2.COLOR_BGR2GRAY)
+        collected.without.append(np.array(grey))
         return False
     collected.found += 1
+    collected.legacy += view.legacy
+    if board.dictionary is not None and len(collected.boards) < _LOOKED_AT:
+        seen = seen_board(frame.image, (board.dictionary,))
+        collected.boards += [] if seen is None else [seen]
     if not collected.collector.add(view):
         return False
     if second is not None:
@@ -234,9 +252,20 @@ def _process(frame: Frame, other: Frame | None, name: str, board: Board, collect
     return True
 
 
-def _described(board: Board) -> str:
-    what = "inner corners" if board.kind == "chessboard" else f"squares, {board.dictionary}"
-    return f"a {board.kind} of {board.columns}x{board.rows} {what}"
+def _check_board(collected: Collected, board: Board) -> None:
+    """Compare the board of the images with the given one. Raises CalibrationError: it is another one."""
+    if not collected.found:
+        dictionaries = dict.fromkeys((board.dictionary or FAMILIES[0], *FAMILIES))
+        found = (seen_board(image, dictionaries) for image in collected.without)
+        collected.boards += [each for each in found if each is not None]
+        if board.kind == "chessboard" and not collected.boards and min(board.columns, board.rows) > 3:
+            # Squares are often counted in place of the inner corners.
+            inner = Board(board.kind, board.columns - 1, board.rows - 1, board.square_m)
+            if any(inner.detect(image) is not None for image in collected.without):
+                raise CalibrationError(f"the images show {described(inner)}; looked for {described(board)}")
+        collected.without.clear()
+    if (why := contradiction(board, collected.boards)) is not None:
+        raise CalibrationError(why)
 
 
 def result_lines(result: CalibrationResult) -> list[str]:

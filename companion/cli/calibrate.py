@@ -14,6 +14,7 @@ from companion.cli.flags import check_finite, check_folder, plain_errors, settin
 from companion.journal import log_to_standard_error
 
 if TYPE_CHECKING:
+    from companion.calibrate import Collected
     from companion.settings import Settings
 
 
@@ -41,6 +42,12 @@ calibrate = typer.Typer(
 
 def _note(text: str) -> None:
     typer.echo(f"companion: {text}", err=True)
+
+
+def _note_pattern(collected: Collected) -> None:
+    if collected.legacy:
+        pattern = "OpenCV's before 4.6 and calib.io's, a marker in the upper-left square"
+        _note(f"the pattern of the board is {pattern} ({collected.legacy} images)")
 
 
 @contextmanager
@@ -110,6 +117,7 @@ def lens(
             f"{collected.frames} images, {collected.found} with the board, "
             f"{len(collected.collector.views)} different views"
         )
+        _note_pattern(collected)
         for view, error in result.rejected:
             _note(f"rejected {view.name}: its error is {error:.2f} px")
         lines = result_lines(result)
@@ -171,6 +179,7 @@ def extrinsics(
         _note(
             f"{collected.frames} pairs of images, {collected.found} with the board, {views} different views"
         )
+        _note_pattern(collected)
         for name, error in result.rejected:
             _note(f"rejected {name}: its error is {error:.2f} px")
         lines = extrinsics_lines(result)

@@ -38,6 +38,7 @@ from mavlink_sim.datasets.board_views import app as board_app
 from mavlink_sim.testing import free_port
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
+from tests.vision.calibration.test_boards import LegacyBoard
 from vision.attitude import quaternion_from_euler
 from vision.calibration.boards import Board
 from vision.calibration.calibrate import CalibrationError
@@ -243,6 +244,58 @@ def test_no_board_in_any_view(few: Path, tmp_path: Path) -> None:
     assert " of 6 images" in line
     assert "8x5" in line
     assert not (tmp_path / "camera.yaml").exists()
+
+
+def charuco_words(size: str, dictionary: str = "4X4_50", marker: str = "0.022") -> tuple[str, ...]:
+    return ("--board", "charuco", size, "--square", "0.03", "--marker", marker, "--dictionary", dictionary)
+
+
+@pytest.fixture(scope="module")
+def legacy(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Views of a board of calib.io, 8 columns and 6 rows."""
+    board = LegacyBoard("charuco", 8, 6, 0.03, 0.022, "4X4_50")
+    path = tmp_path_factory.mktemp("legacy") / "views"
+    write_board_views(path, board, LENSES["webcam"], 8, 3)
+    return path
+
+
+def test_board_of_before_opencv_4_6_gives_a_calibration(legacy: Path, tmp_path: Path) -> None:
+    done = calibrate(legacy, *charuco_words("8x6", "DICT_4X4"), "-o", tmp_path / "camera.yaml")
+    assert done.exit_code == 0, done.output
+    assert "8 images, 8 with " in done.stderr
+    assert "calib.io" in done.stderr
+    assert "upper-left" in done.stderr
+    lens = read_camera_info(tmp_path / "camera.yaml").model
+    assert (lens.fx, lens.fy) == pytest.approx((LENSES["webcam"].fx, LENSES["webcam"].fy), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("words", "given"),
+    [
+        (charuco_words("6x8"), "6x8"),
+        (charuco_words("8x5"), "8x5"),
+        (charuco_words("9x6"), "9x6"),
+        (charuco_words("8x6", "5X5_50"), "5X5_50"),
+        (charuco_words("8x6", "tag36h11"), "APRILTAG_36h11"),
+        (charuco_words("8x6", "4X4_50", "0.015"), "0.50"),
+        (("--board", "chessboard", "9x6", "--square", "0.03"), "chessboard of 9x6"),
+    ],
+)
+def test_other_charuco_than_the_given_is_named(
+    legacy: Path, words: tuple[str, ...], given: str, tmp_path: Path
+) -> None:
+    line = one_line_of_bad_input(calibrate(legacy, *words, "-o", tmp_path / "camera.yaml"))
+    assert "8 columns" in line
+    assert "6 rows" in line
+    assert "4X4" in line
+    assert given in line
+
+
+def test_squares_given_as_inner_corners_are_named(few: Path, tmp_path: Path) -> None:
+    words = ("--board", "chessboard", "8x6", "--square", "0.03")
+    line = one_line_of_bad_input(calibrate(few, *words, "-o", tmp_path / "camera.yaml"))
+    assert "7x5 inner corners" in line
+    assert "8x6 inner corners" in line
 
 
 def test_too_few_views(folder: Path, tmp_path: Path) -> None:

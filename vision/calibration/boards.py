@@ -35,12 +35,14 @@ class BoardView:
         corners_px: (N, 2) float64, the same in the image, pixels.
         size: width and height of the image, pixels.
         name: of the image.
+        legacy: whether it is a ChArUco board as OpenCV drew them before 4.6, and as calib.io does.
     """
 
     points_m: NDArray[np.float64]
     corners_px: NDArray[np.float64]
     size: tuple[int, int]
     name: str = ""
+    legacy: bool = False
 
 
 @dataclass(frozen=True)
@@ -128,18 +130,23 @@ class Board:
     def detect(self, image: NDArray[Any], name: str = "") -> BoardView | None:
         """The board in an image, its corners with sub-pixel accuracy; None if it is not found.
 
-        A chessboard must be seen completely, a ChArUco board only in part.
+        A chessboard must be seen completely, a ChArUco board only in part. With an even number of rows there
+        are two ChArUco boards: OpenCV's, and the one of before 4.6, with a marker in the upper-left square.
+        Either is found; their corners are at the same places.
 
         Args:
             image: (H, W, 3) uint8 BGR or (H, W) uint8 grey.
         """
         grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
-        found = self._chessboard(grey) if self.kind == "chessboard" else self._charuco(grey)
+        if self.kind == "chessboard":
+            found, legacy = self._chessboard(grey), False
+        else:
+            found, legacy = self._charuco(grey)
         if found is None:
             return None
         indices, corners = found
         corners = self._refined(grey, np.asarray(corners, np.float32).reshape(-1, 2))
-        return BoardView(self.points_m[indices], corners, (grey.shape[1], grey.shape[0]), name)
+        return BoardView(self.points_m[indices], corners, (grey.shape[1], grey.shape[0]), name, legacy)
 
     def _refined(self, grey: NDArray[Any], corners: NDArray[np.float32]) -> NDArray[np.float64]:
         """Corners by the gradients around each one (Förstner and Gülch 1987), as far as no marker is near.
@@ -161,16 +168,25 @@ class Board:
         found, corners = cv2.findChessboardCornersSB(grey, shape, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
         return (slice(None), corners) if found else None
 
-    def _charuco(self, grey: NDArray[Any]) -> tuple[Any, Any] | None:
-        corners, identifiers, _, _ = self._detector.detectBoard(grey)
+    def _charuco(self, grey: NDArray[Any]) -> tuple[tuple[Any, Any] | None, bool]:
+        """Indices and pixels of the corners, and whether the board is of before OpenCV 4.6.
+
+        OpenCV gives no corners where the markers are not those of the pattern.
+        """
+        corners, identifiers, markers, marker_ids = self._detector.detectBoard(grey)
+        legacy = identifiers is None and marker_ids is not None and self.rows % 2 == 0
+        if legacy:
+            corners, identifiers, _, _ = self._legacy_detector.detectBoard(
+                grey, markerCorners=markers, markerIds=marker_ids
+            )
         if identifiers is None:
-            return None
+            return None, False
         indices = np.ravel(identifiers)
         least = max(LEAST_CORNERS, math.ceil(LEAST_SHARE * len(self.points_m)))
         across = self.columns - 1
         if len(indices) < least or min(len(set(indices % across)), len(set(indices // across))) < 2:
-            return None
-        return indices, corners
+            return None, False
+        return (indices, corners), legacy
 
     @cached_property
     def _opencv(self) -> cv2.aruco.CharucoBoard:
@@ -182,6 +198,17 @@ class Board:
     @cached_property
     def _detector(self) -> cv2.aruco.CharucoDetector:
         return cv2.aruco.CharucoDetector(self._opencv)
+
+    @cached_property
+    def _legacy_detector(self) -> cv2.aruco.CharucoDetector:
+        board = cv2.aruco.CharucoBoard(
+            self._opencv.getChessboardSize(),
+            self._opencv.getSquareLength(),
+            self._opencv.getMarkerLength(),
+            self._opencv.getDictionary(),
+        )
+        board.setLegacyPattern(True)
+        return cv2.aruco.CharucoDetector(board)
 
     def image(self, square_px: int) -> NDArray[np.uint8]:
         """The print: (H, W) uint8, 0 or 255, with a white margin of one square around it."""

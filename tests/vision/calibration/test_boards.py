@@ -4,16 +4,40 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from mavlink_sim.datasets.board_views import LENSES, BoardCamera, BoardPose
+from mavlink_sim.datasets.board_views import LENSES, BoardCamera, BoardPose, board_poses
 from vision.calibration.boards import Board
+from vision.calibration.seen_boards import FAMILIES, contradiction, seen_board
 from vision.camera_model import CameraModel
+from vision.marker_dictionaries import opencv_dictionary
 from vision.rotation import matrix_from_euler
 
 CHESSBOARD = Board("chessboard", 10, 7, 0.02)
 CHARUCO = Board("charuco", 10, 7, 0.02, 0.015, "4X4_50")
+
+
+class LegacyBoard(Board):
+    """A ChArUco board as OpenCV drew them before 4.6, and as calib.io does."""
+
+    def image(self, square_px: int) -> NDArray[np.uint8]:
+        assert self.marker_m is not None
+        assert self.dictionary is not None
+        size, dictionary = (self.columns, self.rows), opencv_dictionary(self.dictionary)
+        board = cv2.aruco.CharucoBoard(size, self.square_m, self.marker_m, dictionary)
+        board.setLegacyPattern(True)
+        image = np.asarray(board.generateImage((self.columns * square_px, self.rows * square_px)), np.uint8)
+        return np.pad(image, square_px, constant_values=255)
+
+
+def views_of(board: Board, lens: str, count: int, seed: int = 0) -> list[NDArray[np.uint8]]:
+    """Rendered images of a board in random poses."""
+    rng = np.random.default_rng(seed)
+    camera, poses = BoardCamera(board, LENSES[lens]), board_poses(board, LENSES[lens], rng)
+    return [camera.render(next(poses), rng) for _ in range(count)]
 
 
 def test_chessboard_counts_corners_and_charuco_squares() -> None:
@@ -98,3 +122,70 @@ def test_impossible_board_is_refused(arguments: tuple[str, str, float], fact: st
     with pytest.raises(ValueError, match=r"\w") as caught:
         Board.parse(*arguments)
     assert fact in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [(10, 8), (7, 10), (5, 6)])
+@pytest.mark.parametrize("kind", [Board, LegacyBoard])
+def test_either_pattern_of_a_charuco_is_found(kind: type[Board], size: tuple[int, int]) -> None:
+    given = Board("charuco", *size, 0.02, 0.015, "4X4_50")
+    board = kind("charuco", *size, 0.02, 0.015, "4X4_50")
+    view = given.detect(image := board.image(40))
+    assert view is not None
+    assert view.legacy == (kind is LegacyBoard)
+    assert len(view.points_m) == len(given.points_m)
+    middle = (np.array(image.shape[::-1]) - 1) / 2
+    assert np.abs(view.corners_px - middle - view.points_m / given.square_m * 40).max() < 0.1
+
+
+def test_odd_rows_have_one_pattern() -> None:
+    view = CHARUCO.detect(LegacyBoard("charuco", 10, 7, 0.02, 0.015, "4X4_50").image(40))
+    assert view is not None
+    assert not view.legacy
+
+
+@pytest.mark.parametrize("lens", ["webcam", "fisheye"])
+@pytest.mark.parametrize(
+    "board",
+    [
+        CHARUCO,
+        Board("charuco", 7, 10, 0.02, 0.012, "5X5_100"),
+        LegacyBoard("charuco", 11, 8, 0.02, 0.015, "4X4_50"),
+    ],
+)
+def test_layout_of_a_board_is_read_from_its_markers(board: Board, lens: str) -> None:
+    assert board.dictionary is not None
+    assert board.marker_m is not None
+    for image in views_of(board, lens, 3):
+        seen = seen_board(image, (board.dictionary,))
+        assert seen is not None
+        assert (seen.columns, seen.rows) == (board.columns, board.rows)
+        assert seen.marker_first == isinstance(board, LegacyBoard)
+        assert seen.marker_share == pytest.approx(board.marker_m / board.square_m, rel=0.1)
+        assert contradiction(board, [seen]) is None
+
+
+@pytest.mark.parametrize(
+    ("board", "facts"),
+    [
+        (Board("charuco", 7, 10, 0.02, 0.015, "4X4_50"), ("7 columns", "10 rows")),
+        (Board("charuco", 9, 7, 0.02, 0.015, "4X4_50"), ("9 columns", "7 rows")),
+        (Board("charuco", 10, 9, 0.02, 0.015, "4X4_50"), ("10 columns", "9 rows")),
+        (LegacyBoard("charuco", 10, 8, 0.02, 0.015, "4X4_50"), ("10 columns", "8 rows")),
+        (Board("charuco", 10, 7, 0.02, 0.015, "5X5_50"), ("5X5",)),
+        (Board("charuco", 10, 7, 0.02, 0.012, "4X4_50"), ("of 0.",)),
+    ],
+)
+def test_other_board_than_the_given_is_named_with_both(board: Board, facts: tuple[str, ...]) -> None:
+    (image,) = views_of(board, "webcam", 1)
+    seen = seen_board(image, (str(CHARUCO.dictionary), *FAMILIES))
+    assert seen is not None
+    why = contradiction(CHARUCO, [seen])
+    assert why is not None
+    for fact in (*facts, "10x7", "4X4_50"):
+        assert fact in why
+
+
+def test_images_without_a_board_contradict_nothing() -> None:
+    noise = np.random.default_rng(2).integers(0, 256, (240, 320), np.uint8)
+    assert seen_board(noise, FAMILIES) is None
+    assert contradiction(CHARUCO, []) is None
