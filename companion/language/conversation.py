@@ -176,6 +176,9 @@ class Conversation:
                 answer = replace(answer, content="", calls=calls)
             exchange.append(answer)
             if not answer.calls:
+                if len(exchange) == 2 and not answer.content.strip():
+                    self._operator.show("the model gave an empty answer: ask again, or try another model")
+                    return False
                 return success
             # A text may also repeat what a label says: it is always confirmed.
             unconfirmed = None if written else _UNCONFIRMED_OF_MODEL

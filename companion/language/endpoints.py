@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from companion.key_files import KeyFileError, check_private
-from companion.language.tools import MAX_CALLS, ToolCall
+from companion.language.tools import MAX_CALLS, ToolCall, arguments_of, calls_of
 from companion.settings import LanguageSection
 from vision.extras import install_command
 from vision.file_kinds import kind_of_bytes
@@ -26,6 +26,8 @@ MAX_ANSWER_BYTES = 8 * 1024 * 1024
 """Of a whole response, with all that a server may write around the characters."""
 OLLAMA_CONTEXT_TOKENS = 8192
 """The prompt and the functions take some 5400 tokens with 80 classes; Ollama keeps 4096 by default."""
+
+_LOST = "the connection was lost during the answer"
 
 
 class LanguageError(RuntimeError):
@@ -66,9 +68,9 @@ def endpoint_of(url: str, model: str, *, key: str | None = None, timeout_s: floa
         LanguageError: the extra `llm` is not installed.
     """
     try:
-        import ollama  # noqa: F401
+        import httpx  # noqa: F401
     except ImportError as error:
-        raise LanguageError(f"a language model needs ollama: {install_command('ollama')} ({error})") from None
+        raise LanguageError(f"a language model needs httpx: {install_command('httpx')} ({error})") from None
     kind = OpenAIEndpoint if url.rstrip("/").endswith("/v1") else OllamaEndpoint
     return kind(url.rstrip("/"), model, key, timeout_s)
 
@@ -88,7 +90,10 @@ def read_api_key(path: Path) -> str:
         content = path.read_bytes()
         if (kind := kind_of_bytes(content)) is not None:
             raise LanguageError(f"language.key_file {path}: {kind}")
-        return decode_text(content).strip()
+        key = decode_text(content).strip()
+        if not key.isascii() or not key.isprintable():  # it becomes a line of HTTP
+            raise LanguageError(f"language.key_file {path}: expected a line of ASCII text")
+        return key
     except KeyFileError as error:
         raise LanguageError(f"language.key_file {error}") from None
     except OSError as error:
@@ -99,7 +104,7 @@ def read_api_key(path: Path) -> str:
 
 @dataclass(frozen=True, slots=True)
 class OllamaEndpoint:
-    """Ollama, by its own client."""
+    """Ollama: a JSON object per line; each has a piece of the text, or whole calls."""
 
     url: str
     model: str
@@ -109,19 +114,24 @@ class OllamaEndpoint:
     async def answer(
         self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
     ) -> Message:
-        import ollama
-
-        client = ollama.AsyncClient(host=self.url, **_options(self))
-        written = [_for_ollama(message) for message in messages]
+        body = {
+            "model": self.model,
+            "messages": [_for_ollama(message) for message in messages],
+            "tools": tools,
+            "stream": True,
+            "options": {"num_ctx": OLLAMA_CONTEXT_TOKENS},
+        }
         answer = _Answer(on_text)
-        async with _readable(self, f"`ollama pull {self.model}`"):
-            async for part in await client.chat(
-                self.model, written, tools=tools, stream=True, options={"num_ctx": OLLAMA_CONTEXT_TOKENS}
-            ):
-                answer.add_text(part.message.content or "")
-                for call in part.message.tool_calls or ():
-                    answer.add_call(ToolCall(call.function.name, dict(call.function.arguments)))
-                answer.whole = answer.whole or bool(part.done)
+        async with _lines(self, "/api/chat", body) as lines:
+            async for line in lines:
+                if not line.strip():
+                    continue
+                part = _parsed(self, line)
+                message = part.get("message") or {}
+                answer.add_text(message.get("content") or "")
+                for call in calls_of(message.get("tool_calls")):
+                    answer.add_call(call)
+                answer.whole = answer.whole or bool(part.get("done"))
         return answer.message(self.url)
 
 
@@ -137,38 +147,30 @@ class OpenAIEndpoint:
     async def answer(
         self, messages: Sequence[Message], tools: list[dict[str, Any]], on_text: Callable[[str], None]
     ) -> Message:
-        import httpx
-
         body = {
             "model": self.model,
             "messages": [_for_openai(message) for message in messages],
             "tools": tools,
             "stream": True,
         }
-        answer, calls = _Answer(on_text), dict[int, dict[str, str]]()
-        async with (
-            _readable(self, "check language.model and language.url"),
-            httpx.AsyncClient(**_options(self)) as client,
-            client.stream("POST", f"{self.url}/chat/completions", json=body) as response,
-        ):
-            if response.is_error:
-                await response.aread()
-                response.raise_for_status()
-            async for line in response.aiter_lines():
+        answer, calls = _Answer(on_text), dict[int, dict[str, Any]]()
+        async with _lines(self, "/chat/completions", body) as lines:
+            async for line in lines:
+                # A server that does not stream answers with one object, in `message` instead of `delta`.
                 data = line.removeprefix("data:").strip()
-                if not line.startswith("data:"):
+                if not line.startswith(("data:", "{")):
                     continue
                 if data == "[DONE]":
                     answer.whole = True
                     break
-                for choice in json.loads(data)["choices"][:1]:
-                    delta = choice.get("delta") or {}
+                for choice in _parsed(self, data)["choices"][:1]:
+                    delta = choice.get("delta") or choice.get("message") or {}
                     answer.add_text(delta.get("content") or "")
-                    for part in delta.get("tool_calls") or ():
-                        answer.add_part(calls, part)
+                    for number, part in enumerate(delta.get("tool_calls") or ()):
+                        answer.add_part(calls, part, number)
                     answer.whole = answer.whole or choice.get("finish_reason") is not None
             for call in calls.values():
-                answer.add_call(ToolCall(call["name"], _object(call["arguments"]), call["id"]))
+                answer.add_call(ToolCall(call["name"], arguments_of(call["arguments"]), call["id"]))
         return answer.message(self.url)
 
 
@@ -191,9 +193,13 @@ class _Answer:
         _check_calls(len(self._calls))
         self._calls.append(call)
 
-    def add_part(self, calls: dict[int, dict[str, str]], part: dict[str, Any]) -> None:
-        """Add a piece of a call, by its index; name and arguments come in pieces."""
-        index = part.get("index", 0)
+    def add_part(self, calls: dict[int, dict[str, Any]], part: dict[str, Any], number: int) -> None:
+        """Add a piece of a call, by its index; name and arguments come in pieces, or arguments as an object.
+
+        Args:
+            number: of the piece among those that came together: its index if it has none.
+        """
+        index = part.get("index", number)
         if index not in calls:
             _check_calls(len(calls))
         call = calls.setdefault(index, {"id": "", "name": "", "arguments": ""})
@@ -201,8 +207,11 @@ class _Answer:
         function = part.get("function") or {}
         for key in ("name", "arguments"):
             piece = function.get(key) or ""
-            self._count(piece)
-            call[key] += piece
+            if isinstance(piece, str) and isinstance(call[key], str):
+                self._count(piece)
+                call[key] += piece
+            else:
+                call[key] = piece
 
     def _count(self, piece: str) -> None:
         self._characters += len(piece)
@@ -211,20 +220,31 @@ class _Answer:
 
     def message(self, url: str) -> Message:
         if not self.whole:
-            raise LanguageError(f"{url}: the connection was lost during the answer")
+            raise LanguageError(f"{url}: {_LOST}")
         return Message("assistant", self._text, tuple(self._calls))
 
 
 @asynccontextmanager
-async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> AsyncIterator[None]:
-    """Turn every error of an exchange into one line."""
+async def _lines(
+    endpoint: OllamaEndpoint | OpenAIEndpoint, path: str, body: dict[str, Any]
+) -> AsyncIterator[AsyncIterator[str]]:
+    """Post a request; the lines of the answer. Every error of the exchange becomes one line.
+
+    Raises:
+        LanguageError: of the server, the connection or the format.
+    """
     import httpx
-    import ollama
 
     url = endpoint.url
     try:
-        async with asyncio.timeout(endpoint.timeout_s):
-            yield
+        async with (
+            asyncio.timeout(endpoint.timeout_s),
+            httpx.AsyncClient(**_options(endpoint)) as client,
+            client.stream("POST", f"{url}{path}", json=body) as response,
+        ):
+            if not response.is_success:
+                raise LanguageError(_status_text(endpoint, response.status_code, await response.aread()))
+            yield response.aiter_lines()
     except (TimeoutError, httpx.TimeoutException):
         raise LanguageError(
             f"{url}: no whole answer within {endpoint.timeout_s:g} s: try a smaller model, or a longer "
@@ -234,26 +254,58 @@ async def _readable(endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> A
         is_ollama = isinstance(endpoint, OllamaEndpoint)
         start = "start Ollama with `ollama serve`" if is_ollama else f"start the server at {url}"
         raise LanguageError(f"no language model at {url}: {start}, or set language.url") from None
-    except httpx.TransportError as error:
-        raise LanguageError(f"{url}: the connection was lost during the answer: {error}") from None
+    except httpx.RequestError:
+        raise LanguageError(f"{url}: {_LOST}") from None
     except httpx.InvalidURL as error:
         raise LanguageError(f"language.url: {url!r} is not valid: {error}") from None
-    except (ollama.ResponseError, httpx.HTTPStatusError) as error:
-        raise LanguageError(_status_text(error, endpoint, advice)) from None
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        first = str(error).splitlines()[0] if str(error) else ""
-        raise LanguageError(
-            f"{url}: the answer is not in the expected format ({type(error).__name__}: {first[:120]}); "
-            "language.url ends with /v1 for OpenAI's format"
-        ) from None
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raise LanguageError(_format_text(endpoint)) from None
 
 
-def _status_text(error: Any, endpoint: OllamaEndpoint | OpenAIEndpoint, advice: str) -> str:
-    response = getattr(error, "response", None)
-    status = error.status_code if response is None else response.status_code
-    reason = " ".join(str(error.error if response is None else response.text).split())[:200]
-    if status == 404:
+def _parsed(endpoint: OllamaEndpoint | OpenAIEndpoint, line: str) -> Any:
+    """One object of an answer. Raises LanguageError: it is none, or an error of the server."""
+    try:
+        part = json.loads(line)
+    except ValueError:
+        if line.lstrip().startswith("{") and not line.rstrip().endswith("}"):
+            raise LanguageError(f"{endpoint.url}: {_LOST}") from None
+        found = "an HTML page" if line.lstrip()[:1] == "<" else repr(line[:40])
+        raise LanguageError(f"{_format_text(endpoint)}; got {found}") from None
+    if isinstance(part, dict) and part.get("error"):
+        raise LanguageError(f"{endpoint.url}: the server reports: {_reason(line.encode())}")
+    return part
+
+
+def _format_text(endpoint: OllamaEndpoint | OpenAIEndpoint) -> str:
+    kind = "Ollama's" if isinstance(endpoint, OllamaEndpoint) else "OpenAI's"
+    return (
+        f"{endpoint.url}: the answer is not in the expected format, {kind}; language.url ends with /v1 for "
+        "OpenAI's, and has no path for Ollama's"
+    )
+
+
+def _reason(body: bytes) -> str:
+    """What a server says in the body of an error."""
+    text = body[:10_000].decode("utf-8", "replace").strip()
+    if text.startswith("<"):
+        return "an HTML page, as of a proxy or of another server: check language.url"
+    try:
+        said = json.loads(text)
+        while isinstance(said, dict):  # OpenAI: {"error": {"message": …}}
+            said = next(said[key] for key in ("error", "message", "detail") if key in said)
+    except (ValueError, StopIteration, RecursionError):
+        said = text
+    return " ".join(str(said).split())[:200] or "without a reason"
+
+
+def _status_text(endpoint: OllamaEndpoint | OpenAIEndpoint, status: int, body: bytes) -> str:
+    reason = _reason(body)
+    if status == 404 and "model" in reason.lower():
+        is_ollama = isinstance(endpoint, OllamaEndpoint)
+        advice = f"`ollama pull {endpoint.model}`" if is_ollama else "check language.model"
         return f"{endpoint.url}: model {endpoint.model!r} is not there: {advice} ({reason})"
+    if status == 404:
+        return f"{_format_text(endpoint)} (404: {reason})"
     if status in (401, 403):
         return f"{endpoint.url}: access denied ({status}): set language.key_file"
     return f"{endpoint.url}: the server answered {status}: {reason}"
@@ -331,11 +383,3 @@ def _mapping(arguments: Any) -> dict[str, Any]:
 def _check_calls(calls: int) -> None:
     if calls >= MAX_CALLS:
         raise LanguageError(f"the model's answer has more than {MAX_CALLS} calls")
-
-
-def _object(text: str) -> Any:
-    """The arguments of a call; the text itself where it is not JSON, which `read_call` refuses."""
-    try:
-        return json.loads(text or "{}")
-    except (ValueError, RecursionError):
-        return text

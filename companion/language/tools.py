@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from companion.guidance.command import COMMANDS, Command, GrammarError, nearest
@@ -20,7 +20,9 @@ _QUESTION_HELP = {
     "why_not": "why the newest command was refused or ended, and the newest warnings",
 }
 # Before, between and after calls that are written as text.
-_MARKUP = re.compile(r"(?:[\s,;]|```\w*|</?\w+>)*")
+_MARKUP = re.compile(r"(?:[\s,;]|```\w*|</?\w+>|<\|\w+\|>|\[TOOL_CALLS\])*")
+_CALL_KEYS = frozenset({"name", "arguments", "parameters", "type", "id"})
+_THOUGHT = re.compile(r"\A\s*<think>.*?</think>", re.DOTALL)
 # What they fly is not in the call, so nobody could confirm it.
 _NOT_FOR_MODELS = frozenset({"mission", "policy", "velocity"})
 
@@ -78,32 +80,81 @@ def class_names_of(schema: Mapping[str, Any]) -> tuple[str, ...] | None:
     return None if names is None else tuple(map(str, names))
 
 
+def arguments_of(value: Any) -> Any:
+    """The arguments of a call as a server sends them: an object, its JSON text (also twice), or none.
+
+    What is neither is returned as it is, for `read_call` to refuse; so is a text with a key given twice.
+    """
+    for _ in range(2):
+        if not isinstance(value, str):
+            break
+        if not value.strip():
+            return {}
+        try:
+            value = json.loads(value, object_pairs_hook=_unique)
+        except (ValueError, RecursionError):
+            return value
+    return {} if value is None else value
+
+
+def calls_of(value: Any) -> tuple[ToolCall, ...]:
+    """The calls of a message's `tool_calls`. Raises ValueError: they have no names."""
+    each = [] if value is None else value if isinstance(value, list) else [value]
+    return tuple(_call_of(one) for one in each)
+
+
 def calls_in(text: str, offered: Collection[str]) -> tuple[ToolCall, ...]:
     """The calls that a small model writes as text instead of calling.
 
     Args:
-        text: of at most `MAX_CALLS` calls: JSON objects of `name` and `arguments`, also in code fences or
-            tags. Any other word makes it an answer, and there are no calls. So does a name that is no text
-            or arguments that are no object (null: none).
+        text: of at most `MAX_CALLS` calls: JSON objects of `name` and `arguments` (Llama 3: `parameters`), or
+            with these in `function`, also in code fences or tags, after a <think> block. Any other word makes
+            it an answer, and there are no calls. So does another key, a name that is no text or arguments
+            that are no object (null: none).
         offered: names of the tools, which are calls without arguments too.
 
     Returns:
         The calls, without identifiers.
     """
-    calls, end, keys = list[ToolCall](), 0, {"name", "arguments"}
+    text = _THOUGHT.sub("", text)
+    if "<think>" in text:  # without an end
+        return ()
+    calls, end = list[ToolCall](), 0
     try:
         while (begin := _end_of_markup(text, end)) < len(text):
-            value, end = json.JSONDecoder().raw_decode(text, begin)
+            value, end = json.JSONDecoder(object_pairs_hook=_unique).raw_decode(text, begin)
             for each in value if isinstance(value, list) else [value]:
-                if not each.keys() <= keys or (each["name"] not in offered and each.keys() != keys):
+                inner, call = each.get("function", each), replace(_call_of(each), identifier="")
+                known = _CALL_KEYS if inner is each else {"function", "type", "id"}
+                if not (each.keys() <= known and inner.keys() <= _CALL_KEYS):
                     return ()
-                name, arguments = each["name"], each.get("arguments")
-                if not isinstance(name, str) or not isinstance(arguments, dict | None):
+                if not isinstance(call.arguments, dict) or (call.name not in offered and len(inner) < 2):
                     return ()
-                calls.append(ToolCall(name, arguments))
+                calls.append(call)
     except (ValueError, AttributeError, KeyError, TypeError, RecursionError):
         return ()
     return tuple(calls) if len(calls) <= MAX_CALLS else ()
+
+
+def _call_of(value: Any) -> ToolCall:
+    """A call of an object. Raises ValueError: it has no name, or two kinds of arguments."""
+    if not isinstance(value, dict):
+        raise ValueError("no call")
+    function = value.get("function", value)
+    given = [function[key] for key in ("arguments", "parameters") if key in function]
+    if (
+        not isinstance(function.get("name"), str)
+        or len(given) > 1
+        or value.get("type", "function") != "function"
+    ):
+        raise ValueError("no call")
+    return ToolCall(function["name"], arguments_of(*given or (None,)), str(value.get("id") or ""))
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(found := dict(pairs)) < len(pairs):
+        raise ValueError("a key is given twice")
+    return found
 
 
 def _end_of_markup(text: str, begin: int) -> int:
@@ -119,7 +170,7 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
     """
     if not isinstance(call.name, str):
         raise GrammarError(f"unknown tool {str(call.name)[:80]!r}")
-    arguments = {} if call.arguments is None else call.arguments
+    arguments = arguments_of(call.arguments)
     if not isinstance(arguments, Mapping):
         raise GrammarError(f"{call.name}: the arguments must be an object, got {str(call.arguments)[:80]!r}")
     given = {key: value for key, value in arguments.items() if value is not None}

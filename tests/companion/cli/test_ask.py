@@ -324,6 +324,6 @@ def test_control_characters_do_not_reach_the_terminal(capsys: pytest.CaptureFixt
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from companion.language.endpoints import LanguageError, endpoint_of
 
-    monkeypatch.setitem(sys.modules, "ollama", None)
+    monkeypatch.setitem(sys.modules, "httpx", None)
     with pytest.raises(LanguageError, match=r"\[llm\]"):
         endpoint_of("http://127.0.0.1:11434", "small")

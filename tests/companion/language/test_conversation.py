@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import socket
 from collections.abc import Sequence
 from dataclasses import replace
@@ -115,6 +116,10 @@ def test_tools_have_units_ranges_and_classes() -> None:
         ("take off", {}),
         ("", {}),
         ("takeoff", "5"),
+        ("takeoff", "altitude=5"),
+        ("takeoff", '[{"altitude": 5}]'),
+        ("takeoff", '{"altitude": 5, "altitude": 9}'),
+        ("takeoff", '{"altitude": NaN}'),
         ("takeoff", [5]),
         ("takeoff", {"altitude": "high"}),
         ("takeoff", {"altitude": 1000}),
@@ -174,6 +179,18 @@ LAND_TEXT = '{"name": "land", "arguments": null}'
         (f"[{TAKEOFF_TEXT}, {LAND_TEXT}]", ["takeoff", "land"]),
         (TAKEOFF_TEXT * 51, []),
         (f'{TAKEOFF_TEXT}{{"name": "explode", "arguments": {{}}}}', ["takeoff", "explode"]),
+        ('{"name": "takeoff", "parameters": {"altitude": 5}}', ["takeoff"]),
+        ('```json\n{"name": "takeoff", "parameters": {"altitude": "5"}}\n```', ["takeoff"]),
+        ('<|python_tag|>{"type": "function", "name": "takeoff", "parameters": {"altitude": 5}}', ["takeoff"]),
+        ('[TOOL_CALLS] [{"name": "takeoff", "arguments": {"altitude": 5}, "id": "a1b2"}]', ["takeoff"]),
+        (f'{{"type": "function", "function": {TAKEOFF_TEXT}}}', ["takeoff"]),
+        ('{"name": "takeoff", "arguments": "{\\"altitude\\": 5}"}', ["takeoff"]),
+        (f"<think>land? {LAND_TEXT} no</think>\n{TAKEOFF_TEXT}", ["takeoff"]),
+        (f"<think>{LAND_TEXT}", []),
+        ('{"name": "takeoff", "parameters": {"altitude": 5}, "arguments": {"altitude": 9}}', []),
+        ('{"name": "takeoff", "arguments": {"altitude": 5, "altitude": 9}}', []),
+        ('{"name": "takeoff", "name": "land", "arguments": {"altitude": 5}}', []),
+        ('{"type": "object", "name": "takeoff", "parameters": {"altitude": 5}}', []),
         (f"I call {TAKEOFF_TEXT}", []),
         (f"{TAKEOFF_TEXT} now", []),
         ('{"name": "explode"}', []),
@@ -597,9 +614,91 @@ async def test_key_is_sent_to_the_endpoint() -> None:
             assert script.headers["authorization"] == "Bearer secret"
 
 
+# Call as a server sends it → the command of the vehicle; None: refused.
+_FORMS: dict[str, tuple[dict[str, Any], str | None]] = {
+    "object": ({"name": "takeoff", "arguments": {"altitude": 5}}, "takeoff altitude=5"),
+    "text": ({"name": "takeoff", "arguments": '{"altitude": 5}'}, "takeoff altitude=5"),
+    "text of a text": ({"name": "takeoff", "arguments": '"{\\"altitude\\": 5}"'}, "takeoff altitude=5"),
+    "number as text": ({"name": "takeoff", "arguments": {"altitude": "5"}}, "takeoff altitude=5"),
+    "unit": ({"name": "takeoff", "arguments": {"altitude": "5 m"}}, "takeoff altitude=5"),
+    "empty": ({"name": "hold", "arguments": ""}, "hold"),
+    "null": ({"name": "hold", "arguments": None}, "hold"),
+    "text null": ({"name": "hold", "arguments": "null"}, "hold"),
+    "missing": ({"name": "hold"}, "hold"),
+    "key of Llama": ({"name": "takeoff", "parameters": {"altitude": 5}}, "takeoff altitude=5"),
+    "more keys": ({"index": 0, "name": "hold", "arguments": {}, "strict": True}, "hold"),
+    "no JSON": ({"name": "takeoff", "arguments": '{"altitude": '}, None),
+    "key twice": ({"name": "takeoff", "arguments": '{"altitude": 5, "altitude": 50}'}, None),
+    "list": ({"name": "takeoff", "arguments": [5]}, None),
+    "number": ({"name": "takeoff", "arguments": 5}, None),
+    "unknown argument": ({"name": "takeoff", "arguments": {"altitude": 5, "units": "m"}}, None),
+    "not finite": ({"name": "takeoff", "arguments": {"altitude": "NaN"}}, None),
+    "too high": ({"name": "takeoff", "arguments": {"altitude": 5000}}, None),
+    "other case": ({"name": "TAKEOFF", "arguments": {"altitude": 5}}, None),
+    "unknown tool": ({"name": "fly_up", "arguments": {"metres": 5}}, None),
+    "not for models": ({"name": "mission", "arguments": '{"file": "demo"}'}, None),
+}
+
+
+def _sent(function: dict[str, Any], *, streamed: bool = True) -> dict[str, bytes]:
+    """Kind of server → its answer with one call."""
+    calls = [{"id": "call_0", "type": "function", "function": function}]
+    message = {"role": "assistant", "content": "", "tool_calls": calls}
+    plain = {"choices": [{"message": message, "finish_reason": "tool_calls"}]}
+    event = {"choices": [{"delta": message, "finish_reason": "tool_calls"}]}
+    lines = {
+        "": json.dumps({"message": message, "done": True}) + "\n",
+        "/v1": json.dumps(plain) if not streamed else f"data: {json.dumps(event)}\n\n",
+    }
+    return {path: response([line.encode()], "application/json") for path, line in lines.items()}
+
+
+@pytest.mark.parametrize(
+    ("form", "path"),
+    # OpenAI's calls come in pieces, of known keys.
+    [(form, path) for form in _FORMS for path in ("", "/v1") if not path or form != "key of Llama"],
+)
+async def test_every_form_of_a_call_is_read_or_refused(form: str, path: str) -> None:
+    function, expected = _FORMS[form]
+    done = {"": ollama("Done."), "/v1": openai("Done.")}[path]
+    async with serving(_sent(function)[path], done) as script:
+        talk = Talk(script.url + path)
+        assert await talk.ask("please make it rise") is (expected is not None)
+        (result,) = tool_results(script)
+    assert talk.vehicle.commands == ([] if expected is None else [expected])
+    assert ("error" in result) is (expected is None)
+    assert talk.asked == (expected is not None)
+
+
+async def test_answer_of_openai_that_is_not_streamed_is_read() -> None:
+    sent = _sent({"name": "takeoff", "arguments": '{"altitude": 5}'}, streamed=False)["/v1"]
+    async with serving(sent, openai("Done.")) as script:
+        talk = Talk(f"{script.url}/v1")
+        assert await talk.ask("rise")
+    assert talk.vehicle.commands == ["takeoff altitude=5"]
+
+
+async def test_ollamas_call_with_two_kinds_of_arguments_flies_nothing() -> None:
+    function = {"name": "takeoff", "arguments": {"altitude": 5}, "parameters": {"altitude": 50}}
+    async with serving(_sent(function)[""]) as script:
+        talk = Talk(script.url)
+        with pytest.raises(LanguageError, match="expected format"):
+            await talk.ask("rise")
+    assert talk.vehicle.commands == []
+
+
+@pytest.mark.parametrize(("path", "say"), [("", ollama), ("/v1", openai)])
+async def test_empty_answer_says_so_and_is_no_success(path: str, say: Any) -> None:
+    async with serving(say("")) as script:
+        talk = Talk(script.url + path)
+        assert not await talk.ask("hello")
+    assert "empty" in talk.lines[-1]
+
+
 # --- what goes wrong
 
 _MISSING = failure("404 Not Found", {"error": "model 'small' not found"})
+_PAGE = b"<html><body><h1>502 Bad Gateway</h1></body></html>"
 BAD: tuple[tuple[str, bytes, str], ...] = (
     ("", _MISSING, "ollama pull small"),
     ("/v1", _MISSING, "language.model"),
@@ -608,12 +707,25 @@ BAD: tuple[tuple[str, bytes, str], ...] = (
     ("", failure("400 Bad Request", {"error": "small does not support tools"}), "does not support tools"),
     ("", ollama("half an", cut=True), "lost"),
     ("/v1", openai("half an", cut=True), "lost"),
-    ("", response([b'{"message": {"role": "assist'], "application/x-ndjson"), "expected format"),
+    ("", response([b'{"message": {"role": "assist'], "application/x-ndjson"), "lost"),
     ("", response([b"<html>hello</html>"], "text/html"), "expected format"),
     ("/v1", response([b"data: {not json}\n\n"], "text/event-stream"), "expected format"),
     ("/v1", response([b'data: {"choices": 3}\n\n'], "text/event-stream"), "expected format"),
     ("/v1", response([b"<html>hello</html>"], "text/html"), "lost"),
     ("", response([], "application/x-ndjson"), "lost"),
+    ("", failure("404 Not Found", {"error": "not found"}), "/v1"),
+    ("/v1", failure("404 Not Found", {"detail": "Not Found"}), "expected format"),
+    ("", response([_PAGE], "text/html", status="502 Bad Gateway"), "HTML page"),
+    ("/v1", response([_PAGE], "text/html", status="502 Bad Gateway"), "HTML page"),
+    ("", response([_PAGE], "text/html"), "HTML page"),
+    ("", response([b'{"error": "out of memory"}'], "application/json"), "out of memory"),
+    ("/v1", response([b'data: {"error": {"message": "too long"}}'], "text/event-stream"), "too long"),
+    ("", failure("307 Temporary Redirect", {}), "307"),
+    ("", response([b'{"message": 5}'], "application/json"), "expected format"),
+    ("", response([b"[1]"], "application/json"), "expected format"),
+    ("", response([b'{"message": {"content": 5}}'], "application/json"), "expected format"),
+    ("", response([b'{"message": {"tool_calls": [{"function": {}}]}}'], "x/x"), "expected format"),
+    ("/v1", response([b"[1]"], "application/json"), "lost"),
     ("", b"HTTP/1.1 200 OK\r\nbroken", "lost"),
     ("", b"", "lost"),
 )
@@ -626,6 +738,7 @@ async def test_bad_server_is_one_line(path: str, answer: bytes, words: str) -> N
             await Talk(script.url + path).ask("hello")
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+    assert not re.search(r"[A-Z]\w+(Error|Exception)\b|<html", str(caught.value))
 
 
 @pytest.mark.parametrize("path", ["", "/v1"])
