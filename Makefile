@@ -1,4 +1,5 @@
 # Everything a person does here: `make demo`, `make test`, `make lint`. Each makes the virtual environment once.
+# `make browser` installs what the tests of the page need: without it they are left out.
 PYTHON ?= python3
 VENV ?= .venv
 # Where torch is taken from, e.g. TORCH_INDEX=URL of an index of CPU wheels. Empty: pip's own configuration.
@@ -10,7 +11,9 @@ TORCH := --constraint constraints.txt $(if $(TORCH_INDEX),--index-url $(TORCH_IN
 WORKERS ?= auto
 REALTIME_WORKERS ?= 6
 # The files with real-time tests, without those that need an autopilot: each of the workers imports what it is given.
-REALTIME = $(sort $(shell grep -rl mark.realtime tests --include='test_*.py' | xargs grep -L mark.sitl))
+REALTIME = $(filter-out tests/alone/%,$(sort $(shell grep -rl mark.realtime tests --include='test_*.py' | xargs grep -L mark.sitl)))
+PAGE_TESTS := tests/companion/dashboard
+AXE := $(PAGE_TESTS)/node_modules/axe-core/axe.min.js
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -18,7 +21,7 @@ define REFUSE_CUDA
 import json, sys; names = [i["metadata"]["name"] for i in json.load(sys.stdin)["install"]]; cuda = [n for n in names if n.lower().startswith(("nvidia", "cuda", "triton"))]; sys.exit("torch would bring %s: name an index of CPU wheels with TORCH_INDEX=..., or ask for it with ALLOW_CUDA=1" % ", ".join(cuda) if cuda else 0)
 endef
 
-.PHONY: demo test test-slow lint format clean
+.PHONY: demo test test-slow browser chromium lint format clean
 
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
@@ -26,15 +29,26 @@ demo: $(READY)
 # Hundreds of processes are started: bytecode is kept, whatever the environment says.
 test test-slow: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	$(BIN)/python -m pytest tests/alone -m "not slow"
+	$(BIN)/python -m pytest tests/alone -m "not slow" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
+	@$(BIN)/python -m tests.companion.dashboard.programs
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "slow and not realtime"
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
+
+browser: chromium $(AXE)
+
+chromium:
+	which chromium || which chromium-browser || which google-chrome || { apt-get update -qq && \
+		DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends chromium; }
+
+$(AXE): $(PAGE_TESTS)/package-lock.json
+	cd $(PAGE_TESTS) && npm ci --ignore-scripts
+	touch $@
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -56,4 +70,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) $(PAGE_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache

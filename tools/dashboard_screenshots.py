@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mavlink_sim.testing import free_port
+from tests.alone.test_page import REPLY, click_track, open_page
 from tests.companion.dashboard.chromium import Tab, chromium
-from tests.companion.dashboard.test_page import REPLY, click_track, open_page
 from tests.companion.test_play import playing
 
 WIDE, PHONE = (1360, 860), (390, 844)

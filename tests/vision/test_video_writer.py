@@ -6,7 +6,6 @@ import json
 import queue
 import re
 import resource
-import shutil
 import subprocess
 import sys
 import threading
@@ -22,6 +21,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from tests.companion.dashboard.programs import CHROMIUM, needs_chromium
 from vision import video_writer
 from vision.video_writer import VideoWriter, VideoWriterError
 
@@ -247,11 +247,10 @@ class Cinema(SimpleHTTPRequestHandler):
         pass
 
 
+@needs_chromium
 @pytest.mark.realtime
 def test_browser_plays_the_video_to_its_end(tmp_path: Path) -> None:
-    browser = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if browser is None:
-        pytest.skip("no Chromium is installed to play the video in")
+    assert CHROMIUM is not None
     with VideoWriter(tmp_path / "video.webm", 320, 240, 20.0) as writer:
         for index in range(30):
             image = make_image(60, 320, 240)
@@ -267,7 +266,7 @@ def test_browser_plays_the_video_to_its_end(tmp_path: Path) -> None:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         page = f"http://127.0.0.1:{server.server_port}/page.html"
         with subprocess.Popen(
-            [browser, *switches.split(), f"--user-data-dir={tmp_path / 'profile'}", page],
+            [CHROMIUM, *switches.split(), f"--user-data-dir={tmp_path / 'profile'}", page],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         ) as process:

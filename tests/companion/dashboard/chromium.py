@@ -6,7 +6,6 @@ import base64
 import itertools
 import json
 import os
-import shutil
 import signal
 import subprocess
 import time
@@ -15,7 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-PROGRAM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+from tests.companion.dashboard.programs import CHROMIUM
+
 _ANSWER_S = 30.0
 
 
@@ -130,7 +130,7 @@ class Tab:
 @contextmanager
 def chromium(folder: Path) -> Iterator[Browser]:
     """Run Chromium with a new profile in a folder; ends all its processes afterwards."""
-    assert PROGRAM is not None
+    assert CHROMIUM is not None
     to_browser, from_browser = os.pipe(), os.pipe()
 
     def place_pipes() -> None:
@@ -141,7 +141,7 @@ def chromium(folder: Path) -> Iterator[Browser]:
 
     process = subprocess.Popen(
         [
-            *(PROGRAM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
+            *(CHROMIUM, "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"),
             *("--remote-debugging-pipe", f"--user-data-dir={folder}", "--no-first-run"),
             *("--disable-background-networking", "--disable-extensions", "--mute-audio"),
             # Every process of its own costs half a second of a processor.

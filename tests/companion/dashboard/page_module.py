@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
 
 import companion.dashboard
+from tests.companion.dashboard.programs import NODE
 
 PAGE = Path(companion.dashboard.__file__).parent / "page"
-NODE = shutil.which("node")
 
 
 def evaluate(module: str, expression: str, given: Any) -> Any:

@@ -6,9 +6,10 @@ from typing import Any
 
 import pytest
 
-from tests.companion.dashboard.page_module import NODE, evaluate
+from tests.companion.dashboard.page_module import evaluate
+from tests.companion.dashboard.programs import needs_node
 
-pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH")
+pytestmark = needs_node
 
 SILENCE = "without setpoints PX4 holds its position after 1.1 s"
 KNOWN = {

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
+from tests.companion.dashboard.page_module import evaluate
+from tests.companion.dashboard.programs import needs_node
 
-from tests.companion.dashboard.page_module import NODE, evaluate
-
-pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH")
+pytestmark = needs_node
 
 FLOWN = {"command_id": "s-4", "state": "in_progress", "success": True, "reason": "in progress"}
 SHOWN = """

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import random
 
-import pytest
-
-from tests.companion.dashboard.page_module import NODE, evaluate
+from tests.companion.dashboard.page_module import evaluate
+from tests.companion.dashboard.programs import needs_node
 from tests.vision.test_labels import IMAGE, has_room, overlapping
 from vision.labels import Rectangle
 
-pytestmark = pytest.mark.skipif(NODE is None, reason="no node on the PATH")
+pytestmark = needs_node
 
 PLACED = """
 given.map(({ boxes, size, image }) => {

@@ -5,14 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import os
 import re
 import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -25,7 +23,8 @@ from companion.bus.client import listen
 from companion.bus.topics import COMMAND_STATE, DETECTIONS, EVENTS, IMAGE, ROOT, SETPOINT, STATUS, VEHICLE
 from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
-from tests.companion.dashboard.chromium import PROGRAM, Browser, Tab, chromium, wait_for
+from tests.companion.dashboard.chromium import Browser, Tab, chromium, wait_for
+from tests.companion.dashboard.programs import AXE, needs_axe, needs_chromium
 from tests.companion.dashboard.serving import dashboard_command, dashboard_here
 from tests.companion.dashboard.test_bridge import FOUND, NAME, Publisher, frame, publishing
 from tests.companion.dashboard.test_dashboard_fleet import (
@@ -38,11 +37,7 @@ from tests.companion.dashboard.test_dashboard_fleet import (
 from tests.companion.service_process import ServiceProcess
 from tests.companion.test_play import playing
 
-pytestmark = [
-    pytest.mark.realtime,
-    pytest.mark.timeout(240),
-    pytest.mark.skipif(PROGRAM is None, reason="no chromium on the PATH"),
-]
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240), needs_chromium]
 
 SCENE = """
 [ground]
@@ -66,8 +61,6 @@ BOXES = "[...cameras.values()].flatMap((camera) => camera.about ? camera.about.b
 REPLY = "document.querySelector('#reply').textContent"
 LINK = "(document.querySelector('#link')?.textContent ?? '')"
 
-
-AXE = os.environ.get("AXE_CORE")
 OPENED = """
 location.protocol === 'http:' && document.readyState === 'complete'
   && Promise.all(['state', 'stream', 'cameras'].map((name) => import(`/${name}.js`)))
@@ -179,8 +172,21 @@ def test_rectangle_selects_what_is_in_it(tab: Tab) -> None:
     assert sent == pytest.approx({"x": 0.4, "y": 0.3, "width": 0.1, "height": 0.2}, abs=0.01)
 
 
-def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None:
+def on_the_ground(service: ServiceProcess, tab: Tab) -> None:
     tab.until("state.topics.vehicle && state.topics.status")
+    if tab.value("state.topics.vehicle.armed"):
+        assert service.command("land")["success"]
+        tab.until("!state.topics.vehicle.armed", 60.0)
+
+
+def in_the_air(service: ServiceProcess, tab: Tab) -> None:
+    tab.until("state.topics.vehicle && state.topics.status")
+    if tab.value("state.topics.vehicle.altitude_m < 1"):
+        service.take_off(3.0)
+
+
+def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None:
+    on_the_ground(service, tab)
     assert "car" in tab.value("[...document.querySelector('#class').options].map((option) => option.value)")
     tab.value("document.querySelector('#altitude').value = 3")
     tab.value("document.querySelector('[data-command^=takeoff]').click()")
@@ -199,12 +205,6 @@ def test_takeoff_button_and_space_bar(service: ServiceProcess, tab: Tab) -> None
     assert tab.value("document.querySelector('#text').value") == "hold 1"
     tab.press("Enter", "\r")
     tab.until(f"{REPLY}.startsWith('hold 1: ')")
-
-
-def in_the_air(service: ServiceProcess, tab: Tab) -> None:
-    tab.until("state.topics.vehicle && state.topics.status")
-    if tab.value("state.topics.vehicle.altitude_m < 1"):
-        service.take_off(3.0)
 
 
 def test_clicked_car_is_followed(service: ServiceProcess, tab: Tab) -> None:
@@ -310,10 +310,18 @@ def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: Ser
             opened.close()
 
 
-def test_page_says_when_the_dashboard_is_gone(service: ServiceProcess, tab: Tab) -> None:
-    tab.until("state.topics.status")
-    service.process.kill()  # the last test with this service: the next ones have the processor for themselves
-    tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")
+def test_page_says_when_the_dashboard_is_gone(window: Tab) -> None:
+    with publishing() as (service, endpoint), ExitStack() as running:
+        url = running.enter_context(dashboard_here(endpoint))
+        with page_at(window, url) as tab:
+
+            def shown() -> bool:
+                service.publish(STATUS.key(NAME), NOT_HEALTHY)
+                return bool(tab.value("state.topics.status"))
+
+            wait_for(shown)
+            running.close()
+            tab.until(f"/does not answer; everything here is [0-9]+ s old/.test({LINK})")
 
 
 REQUESTS = "performance.getEntriesByType('resource').map((entry) => entry.toJSON())"
@@ -599,12 +607,11 @@ def violations(tab: Tab) -> list[str]:
     return [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]]
 
 
-@pytest.mark.skipif(AXE is None, reason="AXE_CORE does not name the file axe.min.js of npm's axe-core")
+@needs_axe
 @pytest.mark.parametrize("look", LOOKS)
 def test_page_is_accessible(window: Tab, look: str) -> None:
     with populated(window, look) as (tab, end_service):
-        assert AXE is not None
-        tab.value(f"{Path(AXE).read_text()}; 0")
+        tab.value(f"{AXE.read_text()}; 0")
         assert violations(tab) == []
         tab.value("document.querySelector('#detections button').click()")
         assert violations(tab) == []
