@@ -74,6 +74,11 @@ def test_unit_has_the_folders_of_the_program() -> None:
     assert "COMPANION_MODELS_FOLDER" not in UNIT.read_text()
 
 
+def test_what_the_service_writes_is_its_own() -> None:
+    # It writes no model: those are put into the folder, which all read, by `models pull` of root.
+    assert settings(UNIT)["UMask"] == ["0077"]
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 @pytest.mark.parametrize("unit", [UNIT, TEMPLATE], ids=lambda path: path.name)
 def test_exposure_stays_small(unit: Path) -> None:
