@@ -69,7 +69,7 @@ def _one_vehicle(tab: Tab, folder: Path) -> None:
     tab.resize(*WIDE, dark=True)
     time.sleep(1.0)
     tab.screenshot(folder / "dashboard-dark.jpg")
-    tab.resize(*PHONE, phone=True)
+    tab.resize(*PHONE, touch=True)
     time.sleep(1.0)
     tab.screenshot(folder / "dashboard-phone.jpg", quality=70)
 

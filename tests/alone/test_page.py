@@ -280,7 +280,7 @@ def test_second_window_cannot_steer_and_another_command_ends_it(
 
 
 def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
-    tab.resize(390, 844, phone=True)
+    tab.resize(390, 844, touch=True)
     left, top, width, height = rectangle(tab, "#stop")
     assert left >= 0
     assert top > 700
@@ -558,14 +558,19 @@ NOT_HEALTHY = {
 LOOKS: dict[str, dict[str, Any]] = {
     "light": {"width": 1280, "height": 900},
     "dark": {"width": 1280, "height": 900, "dark": True},
-    "phone": {"width": 390, "height": 844, "phone": True},
-    "dark phone": {"width": 390, "height": 844, "phone": True, "dark": True},
+    "phone": {"width": 390, "height": 844, "touch": True},
+    "dark phone": {"width": 390, "height": 844, "touch": True, "dark": True},
+    "phone across": {"width": 844, "height": 390, "touch": True},
+    "tablet": {"width": 768, "height": 1024, "touch": True},
+    "dark tablet": {"width": 768, "height": 1024, "touch": True, "dark": True},
+    "tablet across": {"width": 1024, "height": 768, "touch": True},
+    "dark tablet across": {"width": 1024, "height": 768, "touch": True, "dark": True},
 }
 
 
 @contextmanager
-def populated(window: Tab, look: str) -> Iterator[tuple[Tab, Callable[[], None]]]:
-    """The page with something in every part; what is yielded with it ends the service."""
+def populated(window: Tab, look: str) -> Iterator[tuple[Tab, Callable[[], bool], Callable[[], None]]]:
+    """The page with something in every part; yielded with it: what shows that again, and ends the service."""
     jpeg = cv2.imencode(".jpg", np.full((480, 640, 3), 90, np.uint8))[1].tobytes()
     messages = {
         STATUS.key(NAME): NOT_HEALTHY,
@@ -597,7 +602,13 @@ def populated(window: Tab, look: str) -> Iterator[tuple[Tab, Callable[[], None]]
         tab.value("document.querySelector('[data-command=hold]').click()")
         tab.until(f"{REPLY} === 'hold: accepted, in progress'")
         tab.until("/not healthy: camera: no result/.test(document.querySelector('#link').textContent)")
-        yield tab, running.close
+        yield tab, shown, running.close
+
+
+def open_menu(tab: Tab, shown: Callable[[], bool]) -> None:
+    """Open the menu of the track in the list. Detections leave it within seconds."""
+    press = "[document.querySelector('#detections button')].filter(Boolean).map((item) => item.click())"
+    wait_for(lambda: shown() and tab.value(f"{press}.length"))
 
 
 def violations(tab: Tab) -> list[str]:
@@ -610,10 +621,10 @@ def violations(tab: Tab) -> list[str]:
 @needs_axe
 @pytest.mark.parametrize("look", LOOKS)
 def test_page_is_accessible(window: Tab, look: str) -> None:
-    with populated(window, look) as (tab, end_service):
+    with populated(window, look) as (tab, shown, end_service):
         tab.value(f"{AXE.read_text()}; 0")
         assert violations(tab) == []
-        tab.value("document.querySelector('#detections button').click()")
+        open_menu(tab, shown)
         assert violations(tab) == []
         tab.press("Escape")
         end_service()
@@ -621,23 +632,54 @@ def test_page_is_accessible(window: Tab, look: str) -> None:
         assert violations(tab) == []
 
 
-def test_phone_has_large_targets_sticks_and_a_stop_that_covers_nothing(window: Tab) -> None:
-    with populated(window, "phone") as (tab, end_service):
-        shown = "[...document.querySelectorAll('button, input, select')].filter((one) => one.offsetParent)"
+TOUCHED = [look for look, size in LOOKS.items() if size.get("touch") and not size.get("dark")]
+# What is shown of an element of the header and of the rows below it: left, top, right and bottom.
+EDGES = """
+['#stops', '#vehicle', '#summary', '#link', 'header', 'main', '#sticks'].map((name) => {
+  const one = document.querySelector(name);
+  const { left, top, right, bottom } = one.getBoundingClientRect();
+  return one.hidden ? null : [left, top, right, bottom];
+})
+"""
+
+
+def apart(one: list[float], other: list[float]) -> bool:
+    """Whether two rectangles share no more than a rounded edge."""
+    return any(one[axis + 2] <= other[axis] + 0.5 or other[axis + 2] <= one[axis] + 0.5 for axis in (0, 1))
+
+
+@pytest.mark.parametrize("look", TOUCHED)
+def test_touch_has_large_targets_and_a_stop_that_covers_nothing(window: Tab, look: str) -> None:
+    width, height = LOOKS[look]["width"], LOOKS[look]["height"]
+    with populated(window, look) as (tab, shown, _):
+        open_menu(tab, shown)
+        targets = "[...document.querySelectorAll('button, input, select')].filter((one) => one.offsetParent)"
         small = "({width, height}) => width < 44 || height < 44"
-        tab.value("document.querySelector('#detections button').click()")
-        boxes = f"{shown}.map((one) => [one.outerHTML, one.getBoundingClientRect()])"
+        boxes = f"{targets}.map((one) => [one.outerHTML, one.getBoundingClientRect()])"
         assert tab.value(f"{boxes}.filter(([, box]) => ({small})(box)).map(([html]) => html)") == []
         tab.press("Escape")
         assert "W A S D" not in tab.value("document.body.innerText")
         assert "space bar" not in tab.value("document.body.innerText").lower()
-        edges = "['header', 'main', '#sticks', '#stops'].map((one) => document.querySelector(one))"
-        spans = f"{edges}.filter((one) => one.offsetParent || one.tagName === 'MAIN')"
-        spans += ".map((one) => one.getBoundingClientRect()).map(({top, bottom}) => [top, bottom])"
-        for scroll in (0, 10_000):
-            tab.value(f"document.querySelector('main').scrollTo(0, {scroll})")
-            rows = tab.value(spans)
-            assert all(above[1] <= below[0] + 0.5 for above, below in itertools.pairwise(rows)), rows
+        assert tab.value("document.documentElement.scrollWidth") <= width
+        scrolled = "(document.querySelector('main').scrollTo(0, {0}), scrollTo(0, {0}))"
+        for sticks in ("true", "false"):
+            tab.value(f"document.querySelector('#sticks').hidden = {sticks}")
+            for scroll in (0, 10_000):
+                tab.value(scrolled.format(scroll))
+                stop, *words, header, main, pads = tab.value(EDGES)
+                assert all(apart(stop, one) for one in words)
+                assert pads is None or apart(stop, pads)
+                # What scrolls is under the opaque header, or ends above STOP.
+                assert apart(stop, main) or (header[1] <= stop[1] and stop[3] <= header[3])
+                middle = f"({(stop[0] + stop[2]) / 2}, {(stop[1] + stop[3]) / 2})"
+                assert tab.value(f"document.elementFromPoint{middle}.id") == "stop"
+        tab.value(scrolled.format(0))
+        if look.startswith(("tablet", "phone across")):
+            assert sum(rectangle(tab, "[data-command=hold]")[1::2]) <= height
+
+
+def test_sticks_steer_by_touch_and_go_with_the_service(window: Tab) -> None:
+    with populated(window, "phone") as (tab, _, end_service):
         tab.value("document.querySelector('#steer').click()")
         tab.until(STEERING)
         assert tab.value("!document.querySelector('#sticks').hidden")
@@ -715,7 +757,7 @@ def test_page_of_a_fleet_switches_the_vehicle_and_stops_all(window: Tab) -> None
         assert sorted(received[2:]) == [("vehicle1", "stop"), ("vehicle2", "stop")]
         far = "for (let n = 0; n < 900; n++) extendTrails([{name: 'other', own_ned_m: [n, 0]}])"
         assert tab.value(f"{far}; state.trails.get('other').length") == 500
-        tab.resize(390, 844, phone=True)
+        tab.resize(390, 844, touch=True)
         assert rectangle(tab, "header")[3] < 0.2 * 844
         for number in (0, 1):
             tab.value(f"document.querySelectorAll('#fleet button')[{number}].click()")

@@ -110,12 +110,12 @@ class Tab:
         self.send("Input.dispatchKeyEvent", **down, **common)
         self.send("Input.dispatchKeyEvent", type="keyUp", **common)
 
-    def resize(self, width: int, height: int, *, dark: bool = False, phone: bool = False) -> None:
+    def resize(self, width: int, height: int, *, dark: bool = False, touch: bool = False) -> None:
         """Set the window's size, the colour scheme and the kind of pointer."""
-        scale = 2 if phone else 1
-        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": phone}
+        scale = 2 if touch else 1
+        size = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": touch}
         self.send("Emulation.setDeviceMetricsOverride", **size)
-        self.send("Emulation.setTouchEmulationEnabled", enabled=phone)
+        self.send("Emulation.setTouchEmulationEnabled", enabled=touch)
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.send("Emulation.setEmulatedMedia", features=[scheme])
 
