@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -126,28 +127,37 @@ def pull_named(
         nearest = difflib.get_close_matches(name.lower(), KNOWN, n=3, cutoff=0.0)
         typer.echo(f"companion: unknown official model {name!r}; nearest: {', '.join(nearest)}", err=True)
         raise typer.Exit(2)
-    typer.echo(f"{known.name}: {LICENCE_NOTES[known.licence]}", err=True)
-    with plain_errors(PullError, code=failed), _DownloadBar(known.file) as progress:
-        return download(
+    licence = f"{known.name}: {LICENCE_NOTES[known.licence]}"
+    with plain_errors(PullError, code=failed), _DownloadBar(known.file, licence) as progress:
+        pulled = download(
             known if url is None else at_address(known, url), folder or models_folder(), progress=progress
         )
+    if not pulled.fetched:
+        typer.echo(licence, err=True)
+    return pulled
 
 
 def model_after_pull(model: str, sources: Iterable[str]) -> str:
     """Return the model to use with `--pull`: this one, downloaded if it is not there.
 
     Instead of the bundled one, which knows rendered scenes only, it is `CAMERA_MODEL` where a source is no
-    rendered camera of the simulator.
+    rendered camera of the simulator. A mistyped file is said before the download.
     """
     from vision.catalog import CAMERA_MODEL
     from vision.detector import DEFAULT_MODEL
     from vision.model_files import find_model
+    from vision.sources import SourceError, SourceUnavailableError, check_there
 
+    sources = tuple(sources)
     if model == DEFAULT_MODEL:
         if all(source.startswith("shm://") for source in sources):
             return model
         model = CAMERA_MODEL
     if not find_model(model).exists():
+        with plain_errors(SourceError):
+            for source in sources:
+                with suppress(SourceUnavailableError):  # it may come
+                    check_there(source)
         pull_named(model, failed=EXIT_PASSING)  # the network may be there at the next start
     return model
 
@@ -245,10 +255,11 @@ def _checkpoint(model: str) -> Path:
 
 
 class _DownloadBar:
-    """Bytes, speed and remaining time on standard error, if it is a terminal."""
+    """A line once the server has answered; then bytes, speed and remaining time, if standard error is a terminal."""
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, what: str, first_line: str) -> None:
         self._what = what
+        self._first_line: str | None = first_line
         self._bar: Any = None
         self._task: Any = None
 
@@ -256,6 +267,9 @@ class _DownloadBar:
         return self
 
     def __call__(self, done: int, total: int | None) -> None:
+        if self._first_line is not None:
+            typer.echo(self._first_line, err=True)
+            self._first_line = None
         if not sys.stderr.isatty():
             return
         if self._bar is None:

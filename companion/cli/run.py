@@ -36,9 +36,13 @@ def run(settings: Settings, pull: Pull = False) -> None:
 
 def after_pull(settings: Settings) -> Settings:
     """Return the settings with the model of `--pull`, which is downloaded if it is not there."""
+    from companion.settings.perception import NO_SOURCE
+
     sources = [settings.of_camera(name).source.uri for name in (None, *settings.cameras)]
     detector = settings.detector.model_copy(
-        update={"model": model_after_pull(settings.detector.model, sources)}
+        update={
+            "model": model_after_pull(settings.detector.model, [uri for uri in sources if uri != NO_SOURCE])
+        }
     )
     return settings.model_copy(update={"detector": detector})
 
