@@ -92,6 +92,11 @@ def settings_in_child(data: dict[str, Any]) -> ZenohSection:
     return ZenohSection.model_construct(set(data["given"]), **dict(section))
 
 
+def no_node_text(where: str) -> str:
+    """Return what is said where no service is reached at an endpoint."""
+    return f"no zenoh node at {where}: is `companion run` or `companion play` running there?"
+
+
 @contextmanager
 def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[zenoh.Session]:
     """Open a session that is connected to at least one node.
@@ -114,10 +119,7 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
         except zenoh.ZError as error:
             if time.monotonic() > deadline:
                 where = ", ".join(settings.connect) or "the local network"
-                raise NoAnswerError(
-                    f"no zenoh node at {where}: is `companion run` running? "
-                    "(--connect selects another endpoint)"
-                ) from error
+                raise NoAnswerError(f"{no_node_text(where)} (--connect selects another endpoint)") from error
         time.sleep(0.1)
 
 

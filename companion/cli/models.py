@@ -255,7 +255,7 @@ def _checkpoint(model: str) -> Path:
 
 
 class _DownloadBar:
-    """A line once the server has answered; then bytes, speed and remaining time, if standard error is a terminal."""
+    """A line once the server has answered; on a terminal also bytes, speed and remaining time."""
 
     def __init__(self, what: str, first_line: str) -> None:
         self._what = what

@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from companion.bus.bodies.vehicle import VelocityBody
-from companion.bus.client import NoAnswerError, send_command
+from companion.bus.client import NoAnswerError, no_node_text, send_command
 from companion.bus.session import encode, zenoh_config
 from companion.bus.topics import VELOCITY, alive_key
 from companion.dashboard.bridge import Bridge, Link
@@ -252,9 +252,7 @@ class Fleet:
         try:
             self._link.session = await asyncio.to_thread(zenoh.open, zenoh_config(self._settings))
         except zenoh.ZError:
-            self._link.problem = (
-                f"no zenoh node at {', '.join(self._settings.connect)}: is `companion run` running?"
-            )
+            self._link.problem = no_node_text(", ".join(self._settings.connect))
             return
         self._link.problem = ""
         self._subscribe()

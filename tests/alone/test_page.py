@@ -399,7 +399,7 @@ def test_cameras_take_turns_and_stop_has_a_free_connection(browser: Browser, win
 def test_page_shows_a_silent_service_and_the_age_of_its_state(window: Tab) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     with dashboard_here(endpoint) as url, page_at(window, url) as tab:
-        tab.until(f"{LINK}.includes('is `companion run` running?')")
+        tab.until(f"{LINK}.includes('no zenoh node at ')")
         with publishing(endpoint) as (service, _):
 
             def shown() -> bool:
