@@ -1,7 +1,7 @@
 """Runs commands of a document as a reader does: one after the other, as printed, in the present folder.
 
-A command that keeps running has a terminal of its own until another of its kind starts or the page ends;
-then it gets a Ctrl-C. `python -m tests.page_commands COMMAND…` prints each that failed.
+A command that keeps running has a terminal of its own until another of its kind starts, a line that needs its end
+comes or the page ends; then it gets a Ctrl-C. `python -m tests.page_commands COMMAND…` prints each that failed.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 
 from tests.companion.service_process import ServiceProcess
 
@@ -20,20 +21,33 @@ KEPT = (
     ("companion play", "service", "", "Ctrl-C ends it"),
     ("companion run", "service", "shm://", "up: autopilot"),
     ("companion run", "service", "", "ready: commands on"),
+    ("companion view", "service", "", "up: camera"),
+    ("ffmpeg -i", "service", "| companion run", "up: camera"),
     ("companion dashboard", "dashboard", "", ""),
+    ("companion mcp --listen", "tools", "", "running on"),
     ("mavlink-sim --", "vehicle", "", ""),
 )
-WATCHED = ("companion echo", "companion markers shm://")  # prints without end
+AFTER_FLIGHT = ("companion replay", "companion collect")  # the page ends the service before
+WATCHED = (  # prints without end
+    "companion echo",
+    "companion markers shm://",
+    "companion preview shm://",
+    "companion collect myset --",
+)
 WATCHED_S = 3.0
+QUESTION, ANSWER = "fly this? [y/N]", b"y\n"
+ASKS = 'companion ask "'
 COMMAND_S = 120.0
 ENDED = (0, 128 + signal.SIGINT)
+DIFFERENT = 1
+"""Exit code of a replay that found what it was asked for: differences."""
 
 
 def open_terminal(line: str) -> ServiceProcess:
     return ServiceProcess(
         subprocess.Popen(
             ["bash", "-c", line],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE if line.startswith(ASKS) else subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             start_new_session=True,
@@ -47,6 +61,22 @@ def interrupt(terminal: ServiceProcess) -> int:
     if terminal.process.poll() is None:
         os.killpg(terminal.pid, signal.SIGINT)
     return terminal.process.wait(60.0)
+
+
+def answer(terminal: ServiceProcess) -> None:
+    """Wait for the question, if there is one, and answer it."""
+    stdin = terminal.process.stdin
+    assert stdin is not None
+    with suppress(TimeoutError, BrokenPipeError), stdin:
+        terminal.wait_for_line(QUESTION, COMMAND_S)
+        stdin.write(ANSWER)
+        stdin.flush()
+        terminal.process.wait(COMMAND_S)  # the end of the input would be an answer too
+
+
+def codes(line: str) -> tuple[int, ...]:
+    """The exit codes that are no failure."""
+    return (*ENDED, DIFFERENT) if line.startswith("companion replay") else ENDED
 
 
 def failures(lines: Sequence[str]) -> Iterator[str]:
@@ -71,15 +101,19 @@ def failures(lines: Sequence[str]) -> Iterator[str]:
                     yield report(line, "not ready", terminal)
                 break
         else:
-            terminal = open_terminal(line)
             watched = line.startswith(WATCHED)
+            if line.startswith(AFTER_FLIGHT) and not watched:
+                yield from end("service")
+            terminal = open_terminal(line)
+            if line.startswith(ASKS):
+                answer(terminal)
             try:
                 code = terminal.process.wait(WATCHED_S if watched else COMMAND_S)
             except subprocess.TimeoutExpired:
                 code = interrupt(terminal)
                 if not watched:
                     yield report(line, "did not end", terminal)
-            if code not in ENDED:
+            if code not in codes(line):
                 yield report(line, f"exit code {code}", terminal)
     for kind in list(kept):
         yield from end(kind)

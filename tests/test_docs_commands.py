@@ -38,6 +38,8 @@ NOT_RUN = {
     "mavlink-sim --scene field.toml": "the reader's scene",
     "--frames 500": "renders for 15 s",
     "--frames 2000": "renders for 70 s",
+    "pip install": "a download",
+    "14_16_02.ulg": "a log that PX4 wrote",
 }
 PAGES_NOT_RUN = {
     "README.md": "make, pip; images, video and a SITL of the reader",
@@ -51,7 +53,6 @@ PAGES_NOT_RUN = {
     "install.md": "pip and downloads",
     "plug-ins.md": "pip installs the examples",
     "policies.md": "trains two million steps",
-    "record-and-replay.md": "names of files of another flight",
     "sitl.md": "an autopilot's SITL",
     "systemd.md": "a board with systemd",
     "train.md": "photographs, and hours of training",
