@@ -1,7 +1,8 @@
 """Runs commands of a document as a reader does: one after the other, as printed, in the present folder.
 
-A command that keeps running has a terminal of its own until another of its kind starts, a line that needs its end
-comes or the page ends; then it gets a Ctrl-C. `python -m tests.page_commands COMMAND…` prints each that failed.
+A command that keeps running has a terminal of its own until another of its kind starts, until a command that
+needs its end comes, or until the page ends; then it gets a Ctrl-C. `python -m tests.page_commands COMMAND…`
+prints each that failed.
 """
 
 from __future__ import annotations
