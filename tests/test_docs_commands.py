@@ -39,14 +39,13 @@ NOT_RUN = {
     "--frames 500": "renders for 15 s",
     "--frames 2000": "renders for 70 s",
     "pip install": "a download",
+    "--language-model": "a language model",
     "14_16_02.ulg": "a log that PX4 wrote",
 }
 PAGES_NOT_RUN = {
     "README.md": "make, pip; images, video and a SITL of the reader",
     "CONTRIBUTING.md": "make runs the tests",
     "formation.md": "a fleet and a benchmark",
-    "ask.md": "needs a service that the page does not start",
-    "avoid.md": "needs a vehicle that the page does not start",
     "cameras.md": "cameras, pipes and folders of images",
     "campaigns.md": "a Ray cluster",
     "environments.md": "compiles the simulator",
