@@ -1,4 +1,4 @@
-"""Tasks: background ones that do not end unseen or for ever, and some that begin and end together."""
+"""Tasks: background ones that do not end unseen, or end for good, and some that begin and end together."""
 
 from __future__ import annotations
 
