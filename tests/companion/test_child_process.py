@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from companion import child_process, restarts
+from companion.passing import EXIT_PASSING
 
 pytestmark = pytest.mark.realtime
 
@@ -90,3 +91,31 @@ def test_program_is_started_again_without_end(tmp_path: Path, monkeypatch: pytes
         *(f"restarting ({count} of 5)" for count in range(1, 6)),
         "tried again every 0.02 s, 6 failures so far",  # and the same reason again is not said
     ]
+
+
+@pytest.mark.parametrize(("code", "again"), [(EXIT_PASSING, True), (child_process.EXIT_REFUSED, False)])
+def test_reason_that_may_pass_is_said_once_and_tried_again(
+    code: int, again: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(child_process, "LATER_S", 0.01)
+    (tmp_path / "refusing_program.py").write_text(f"import sys; print('port 1 is taken'); sys.exit({code})")
+    said: list[str] = []
+    ends: list[tuple[str, bool]] = []
+
+    async def until_ended() -> None:
+        enough = asyncio.Event()
+
+        def on_end(why: str, is_again: bool) -> None:
+            ends.append((why, is_again))
+            if len(ends) == (3 if again else 1):
+                enough.set()
+
+        async with child_process.child_process(
+            "program", "refusing_program", "{}", said.append, on_end=on_end
+        ):
+            await enough.wait()
+
+    asyncio.run(until_ended())
+    assert said == ["program: port 1 is taken"]
+    assert ends[0] == ("port 1 is taken", again)
