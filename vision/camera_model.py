@@ -135,9 +135,10 @@ class CameraModel:
             return pixels
         plane = points[:, :2] / np.where(points[:, 2:] > 1e-9, points[:, 2:], np.nan)
         if self.distortion:
-            plane = np.where(
-                _unfolded(self.distortion, plane)[:, None], _distorted(self.distortion, plane), np.nan
-            )
+            largest = _max_radius(self.distortion) * (1.0 + _INVERTED)
+            beyond = plane[:, 0] ** 2 + plane[:, 1] ** 2 > largest**2
+            plane = _distorted(self.distortion, plane)
+            plane[beyond] = np.nan
         return plane * (self.fx, self.fy) + (self.cx, self.cy)
 
     def rays(self, pixels: NDArray[Any]) -> NDArray[np.float64]:
@@ -246,13 +247,6 @@ def _max_radius(coefficients: tuple[float, ...]) -> float:
     return math.sqrt(min(squares, default=math.inf))
 
 
-def _unfolded(coefficients: tuple[float, ...], plane: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) whether the distortion of points at unit depth is within the first fold of the image."""
-    xx, xy, yy = _slopes(coefficients, plane)
-    within: NDArray[np.bool_] = (plane * plane).sum(axis=1) <= _max_radius(coefficients) ** 2
-    return within & (xx > 0.0) & (xx * yy - xy * xy > 0.0)
-
-
 def _undistorted(
     coefficients: tuple[float, ...], wanted: NDArray[np.float64], plane: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -270,7 +264,8 @@ def _undistorted(
             xx, xy, yy = _slopes(coefficients, plane)
             step = np.column_stack([yy * error[:, 0] - xy * error[:, 1], xx * error[:, 1] - xy * error[:, 0]])
             plane = np.where(found[:, None], plane, plane - step / (xx * yy - xy * xy)[:, None])
-        found &= _unfolded(coefficients, plane)
+        xx, xy, yy = _slopes(coefficients, plane)  # the tangential distortion may fold it before the radial
+        found &= (xx > 0.0) & (xx * yy - xy * xy > 0.0)
     return np.where(found[:, None], plane, np.nan)
 
 
