@@ -156,6 +156,17 @@ def test_video_of_16_bit_grey_is_stretched(tmp_path: Path, caplog: pytest.LogCap
     assert caplog.text.count("values 7000 to 7063") == 1
 
 
+def test_video_of_big_endian_grey_says_that_it_may_be_dark(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path, images = tmp_path / "thermal.mov", ("-f", "lavfi", "-i", "testsrc=size=64x48:duration=0.1")
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", *images, "-pix_fmt", "gray16be"]
+    subprocess.run([*command, "-c:v", "png", str(path)], check=True)
+    with open_source(str(path)) as source:
+        assert next(iter(source)).image.shape == (48, 64, 3)
+    assert caplog.text.count("gray16le") == 1
+
+
 def test_image_that_cannot_be_shown_names_why(tmp_path: Path) -> None:
     floats = tmp_path / "float.tiff"
     assert cv2.imwrite(str(floats), np.ones((8, 8), np.float32))

@@ -27,7 +27,7 @@ from vision.sources.source import EndOfStream, SourceError
 logger = logging.getLogger(__name__)
 
 # FFmpeg's gray16le, of which OpenCV would deliver the upper byte.
-_GREY_16 = int.from_bytes(b"Y1\0\x10", "little")
+_GREY_16, _GREY_16_BIG_ENDIAN = (int.from_bytes(b"Y1\0\x10", order) for order in ("little", "big"))
 _CAP_PROP_PTS = 71  # stamp in frame intervals; its name is missing before OpenCV 4.11, where it is 0
 
 
@@ -147,8 +147,16 @@ class VideoFileCapture(Capture):
                 f"another kind of file"
             )
             raise SourceError(explained(path, problem, "is a video"))
-        if self._capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == _GREY_16:
+        pixel_format = self._capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)
+        if pixel_format == _GREY_16:
             self._capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        elif pixel_format == _GREY_16_BIG_ENDIAN:
+            logger.warning(
+                "%s: 16-bit grey, big-endian, is shown by its upper byte and may be dark; convert it: "
+                "ffmpeg -i %s -c:v ffv1 -pix_fmt gray16le converted.mkv",
+                path,
+                path.name,
+            )
         self.interval_s = interval_of(self._capture)
         self._grabbed = self._capture.grab()
         self._claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
