@@ -279,21 +279,37 @@ def test_second_window_cannot_steer_and_another_command_ends_it(
     tab.until(f"!({STEERING})")
 
 
-def test_page_shows_a_stop_button_and_names_on_a_phone(tab: Tab) -> None:
-    tab.resize(390, 844, touch=True)
-    left, top, width, height = rectangle(tab, "#stop")
-    assert left >= 0
-    assert top > 700
-    assert left + width <= 390
-    assert top + height <= 844
-    assert tab.value("document.documentElement.scrollWidth") <= 390
-    steer, turn = rectangle(tab, "#steer"), rectangle(tab, "#steer-turn")
-    tab.until("state.topics.status && [...cameras.values()].some((camera) => camera.bitmap !== null)")
-    assert rectangle(tab, "#steer") == pytest.approx(steer, abs=1.0)  # what arrives does not move the buttons
-    assert steer[1] < turn[1] + turn[3] / 2 < steer[1] + steer[3]  # in one row
-    named = "control.ariaLabel || control.textContent.trim() || (control.labels && control.labels.length)"
-    controls = "[...document.querySelectorAll('button, input, select, canvas')]"
-    assert tab.value(f"{controls}.filter((control) => !({named})).map((control) => control.outerHTML)") == []
+def test_page_shows_a_stop_button_and_names_on_a_phone(window: Tab) -> None:
+    healthy = {**NOT_HEALTHY, "healthy": True, "unhealthy": []}
+    jpeg = cv2.imencode(".jpg", np.zeros((480, 640, 3), np.uint8))[1].tobytes()
+    with publishing() as (service, endpoint), dashboard_here(endpoint) as url, page_at(window, url) as tab:
+        sequence = itertools.count(1)
+
+        def shown() -> bool:
+            number = next(sequence)
+            for key, body in ((STATUS, healthy), (VEHICLE, SEEN), (DETECTIONS, frame(number))):
+                service.publish(key.key(NAME), body)
+            service.image(number, jpeg)
+            caption = "(document.querySelector('figcaption')?.textContent ?? '').includes('7.0 results/s')"
+            return bool(tab.value(f"{LINK} === 'PX4 · healthy' && {caption} && {BOXES}.length"))
+
+        tab.resize(390, 844, touch=True)
+        left, top, width, height = rectangle(tab, "#stop")
+        assert left >= 0
+        assert top > 700
+        assert left + width <= 390
+        assert top + height <= 844
+        assert tab.value("document.documentElement.scrollWidth") <= 390
+        steer, turn = rectangle(tab, "#steer"), rectangle(tab, "#steer-turn")
+        wait_for(shown)
+        # What arrives does not move the buttons.
+        assert rectangle(tab, "#steer") == pytest.approx(steer, abs=1.0)
+        assert steer[1] < turn[1] + turn[3] / 2 < steer[1] + steer[3]  # in one row
+        named = "control.ariaLabel || control.textContent.trim() || (control.labels && control.labels.length)"
+        controls = "[...document.querySelectorAll('button, input, select, canvas')]"
+        assert (
+            tab.value(f"{controls}.filter((control) => !({named})).map((control) => control.outerHTML)") == []
+        )
 
 
 def test_stop_works_with_the_page_in_many_windows(browser: Browser, service: ServiceProcess) -> None:
@@ -549,7 +565,8 @@ SEEN = {
     "position_ned_m": [3.0, 4.0, -4.0],
 }  # fmt: skip
 NOT_HEALTHY = {
-    "service": "s", "stamp_ns": 1, "healthy": False, "unhealthy": ["camera: no result for 3.1 s"],
+    "service": "s", "stamp_ns": 1, "healthy": False,
+    "unhealthy": ["camera: no result for 3.1 s", "PREFLIGHT_FAIL_" * 6],
     "vehicle": {"autopilot": "PX4", "without_service": "without setpoints PX4 holds its position"},
     "parts": [{"name": "autopilot", "state": "ready", "reason": "", "next_try_ns": None}],
     "pilot": {"mission": MISSION, "behaviour": "holding"}, "limits": {}, "gimbal": None,
@@ -657,10 +674,16 @@ def test_touch_has_large_targets_and_a_stop_that_covers_nothing(window: Tab, loo
         small = "({width, height}) => width < 44 || height < 44"
         boxes = f"{targets}.map((one) => [one.outerHTML, one.getBoundingClientRect()])"
         assert tab.value(f"{boxes}.filter(([, box]) => ({small})(box)).map(([html]) => html)") == []
+        menu = rectangle(tab, "#menu")
+        stop, *_ = tab.value(EDGES)
+        assert apart(stop, [menu[0], menu[1], menu[0] + menu[2], menu[1] + menu[3]])
         tab.press("Escape")
         assert "W A S D" not in tab.value("document.body.innerText")
         assert "space bar" not in tab.value("document.body.innerText").lower()
+        cut = "({scrollWidth, clientWidth}) => scrollWidth > clientWidth + 1"
+        parts = f"[...document.querySelectorAll('header > *, section')].filter({cut})"
         assert tab.value("document.documentElement.scrollWidth") <= width
+        assert tab.value(f"{parts}.map((one) => one.id)") == []
         scrolled = "(document.querySelector('main').scrollTo(0, {0}), scrollTo(0, {0}))"
         for sticks in ("true", "false"):
             tab.value(f"document.querySelector('#sticks').hidden = {sticks}")

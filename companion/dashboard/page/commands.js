@@ -128,7 +128,10 @@ export function openMenu(track, x, y, opener = null) {
   menu.hidden = false;
   const box = menu.getBoundingClientRect();
   menu.style.left = `${Math.max(4, Math.min(x, innerWidth - box.width - 4))}px`;
-  menu.style.top = `${Math.max(4, Math.min(y, innerHeight - box.height - 4))}px`;
+  // Between the header and what is at the bottom of a phone: STOP is above everything.
+  const top = document.querySelector("header").getBoundingClientRect().bottom;
+  const bottom = Math.min(innerHeight, document.querySelector("main").getBoundingClientRect().bottom);
+  menu.style.top = `${Math.max(top + 4, Math.min(y, bottom - box.height - 4))}px`;
   menu.querySelector("button").focus();
 }
 
