@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mavlink_sim.testing import free_port
-from tests.alone.test_page import REPLY, click_track, open_page
+from tests.alone.test_page import OPENED, REPLY, click_track, open_page
 from tests.companion.dashboard.chromium import Tab, chromium
 from tests.companion.test_play import playing
 
@@ -70,6 +70,9 @@ def _one_vehicle(tab: Tab, folder: Path) -> None:
     time.sleep(1.0)
     tab.screenshot(folder / "dashboard-dark.jpg")
     tab.resize(*PHONE, touch=True)
+    tab.send("Page.reload")  # the kind of pointer is read once
+    tab.until(OPENED)
+    tab.until("[...cameras.values()].some((camera) => camera.about?.boxes.length)")
     time.sleep(1.0)
     tab.screenshot(folder / "dashboard-phone.jpg", quality=70)
 
