@@ -181,7 +181,7 @@ def on_the_ground(service: ServiceProcess, tab: Tab) -> None:
 
 def in_the_air(service: ServiceProcess, tab: Tab) -> None:
     tab.until("state.topics.vehicle && state.topics.status")
-    if tab.value("state.topics.vehicle.altitude_m < 1"):
+    if not tab.value("state.topics.vehicle.armed"):
         service.take_off(3.0)
 
 
