@@ -128,3 +128,16 @@ def test_an_address_that_means_another_names_the_remedy(uri: str, remedy: str, c
     assert text.startswith("rtsp://admin:***@" if uri.startswith("rtsp") else "http://admin:***@")
     assert "TER" not in text
     assert "\n" not in text
+
+
+@pytest.mark.parametrize("check", [check_address, open_source])
+@pytest.mark.parametrize("start", ["", "rtsp:", "rtsp:/", "http:/"])
+@pytest.mark.parametrize("secret", ["HUTER", "HU/TER", "HU@TER", "HU#TER"])
+def test_an_address_without_slashes_is_no_file_name(start: str, secret: str, check: object) -> None:
+    assert callable(check)
+    with pytest.raises(SourceError) as refused:
+        check(f"{start}admin:{secret}@127.0.0.1:554/x", SourceSettings())
+    text = str(refused.value)
+    assert text.startswith("***@127.0.0.1:554/x: ")
+    assert "rtsp://USER" in text
+    assert "TER" not in text

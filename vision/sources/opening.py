@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import difflib
 import os
+import re
 import stat
 import sys
 from collections.abc import Callable
@@ -16,7 +17,7 @@ from pathlib import Path
 from vision.calibration.camera_info import read_registration
 from vision.home import expanded
 from vision.image_file import is_image
-from vision.redaction import without_password
+from vision.redaction import HIDDEN, without_password
 from vision.registry import shown
 from vision.sources.camera import CameraCapture, camera_device, check_camera
 from vision.sources.capture import Capture, LoopingCapture
@@ -46,6 +47,8 @@ _WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "re
 # Suffixes of names that may be a device's, a FIFO's or a mount's, which come by themselves.
 _OF_PIPES = ("", ".fifo", ".pipe")
 _NETWORK = ("rtsp", "rtsps", "http", "https")
+# `admin:pw@camera/1` and `rtsp:/admin:pw@camera/1`: taken for a file, its error would show the password.
+_WITHOUT_SLASHES = re.compile(r"(?:[A-Za-z][A-Za-z0-9+.-]*:/?)?[^/\s:@]*:[^\s]*@[^\s@]+", re.ASCII)
 _WITHOUT_DEPTH = ("csi", "rtsp", "rtsps", "http", "https", "udp")
 
 
@@ -108,6 +111,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
         check_camera(device, settings)
         return LatestSource(str(device), lambda: CameraCapture(device, settings), settings)
     if not scheme:
+        _refuse_without_slashes(uri)
         return _open_path(expanded(uri), settings)
     opener = _opener(scheme, name)
     if scheme in _NETWORK:
@@ -338,7 +342,16 @@ def check_there(uri: str) -> None:
     if (device := camera_device(uri)) is not None:
         check_camera(device, SourceSettings())
     elif uri != "-" and ("://" not in uri or uri.startswith("file://")):
+        _refuse_without_slashes(uri)
         _mode(Path(_rest(uri)) if "://" in uri else expanded(uri))
+
+
+def _refuse_without_slashes(uri: str) -> None:
+    if _WITHOUT_SLASHES.fullmatch(uri) and not expanded(uri).exists():
+        raise SourceError(
+            f"{HIDDEN}@{uri.rpartition('@')[2]}: an address with a password needs its scheme and ://, as in "
+            "rtsp://USER:PASSWORD@HOST/PATH"
+        )
 
 
 def _mode(path: Path) -> int:
