@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import unicodedata
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,40 @@ def test_coco_image_ids_may_be_text_beside_numbers(tmp_path: Path) -> None:
     assert sample.class_ids.tolist() == [0]
 
 
+def test_coco_category_ids_may_be_text_and_sizes_floats(tmp_path: Path) -> None:
+    boxes = [{"image_id": 7, "category_id": "90", "bbox": [0, 0, 5, 5]}]
+    listed = {"id": 7, "file_name": "a.jpg", "width": 200.0, "height": 100.0}
+    (sample,) = open_dataset(coco(tmp_path, annotations=boxes, images=[listed])).samples
+    assert (sample.class_ids.tolist(), sample.stated_size) == ([1], (200, 100))
+
+
+@pytest.mark.parametrize(
+    ("stored", "listed"),
+    [
+        ("b.jpg", "val2017\\b.jpg"),
+        (unicodedata.normalize("NFD", "gärten.jpg"), unicodedata.normalize("NFC", "gärten.jpg")),
+        (unicodedata.normalize("NFC", "gärten.jpg"), unicodedata.normalize("NFD", "gärten.jpg")),
+    ],
+)
+def test_coco_file_names_of_other_systems_are_found(tmp_path: Path, stored: str, listed: str) -> None:
+    make_image(tmp_path / "val2017" / stored)
+    (sample,) = open_dataset(coco(tmp_path, images=[{"id": 7, "file_name": listed}])).samples
+    assert sample.image.name == stored
+
+
+def test_a_coco_box_beyond_its_image_is_refused(tmp_path: Path) -> None:
+    corners = [{"image_id": 7, "category_id": 3, "bbox": [120, 50, 190, 90]}]
+    (sample,) = open_dataset(coco(tmp_path, annotations=corners)).samples
+    with pytest.raises(DatasetError, match=r"a\.jpg: .*\[120, 50, 190, 90\] .* 200x100 "):
+        sample.boxes_in(200, 100)
+
+
+def test_a_number_of_classes_that_contradicts_the_names_is_refused(yolo: Path) -> None:
+    table = text(yolo / "data.yaml", "val: images/val\nnc: 3\nnames: [one, two]\n")
+    with pytest.raises(DatasetError, match=r"data\.yaml: `nc` is 3.* 2 classes"):
+        open_dataset(table)
+
+
 @pytest.mark.parametrize("keypoint", ["0.5 0.5 2", "0.5 0.5"])
 def test_box_of_a_label_with_keypoints(yolo: Path, keypoint: str) -> None:
     each = len(keypoint.split())
@@ -236,6 +271,7 @@ def annotated(**changes: Any) -> dict[str, Any]:
         ({"categories": []}, "has no categories"),
         ({"categories": [{"id": 1}]}, "category 0: expected"),
         ({"images": [{"id": 7, "file_name": "gone.jpg"}]}, "image 0: gone.jpg .*--images"),
+        ({"images": [{"id": 7, "file_name": "a.jpg"}] * 2}, "image 1: its id 7"),
     ],
 )  # fmt: skip
 def test_a_wrong_entry_of_a_coco_file_is_named(

@@ -13,6 +13,7 @@ import json
 import logging
 import math
 import os
+import unicodedata
 from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -106,7 +107,8 @@ class Sample:
         """(N, 4) float32 xyxy in the pixels of an image of this size.
 
         Raises:
-            DatasetError: the data set states another size, so its boxes are of another image.
+            DatasetError: the data set states another size, or the middle of a box is outside, so its boxes
+                are of another image.
         """
         if self.stated_size is not None and self.stated_size != (width, height):
             stated_width, stated_height = self.stated_size
@@ -118,6 +120,15 @@ class Sample:
                 f"the original"
             )
         if not self.in_fractions:
+            middles = (self.boxes[:, :2] + self.boxes[:, 2:]) / 2
+            outside = np.any((middles < 0) | (middles > (width, height)), axis=1)
+            if outside.any():
+                left, top, right, bottom = self.boxes[int(np.argmax(outside))].tolist()
+                raise DatasetError(
+                    f"{self.image}: the middle of the bbox [{left:g}, {top:g}, {right - left:g}, "
+                    f"{bottom - top:g}] is outside the image of {width}x{height} pixels: it is of a larger "
+                    f"image, or not [left, top, width, height]"
+                )
             return self.boxes
         return self.boxes * np.array([width, height, width, height], np.float32)
 
@@ -211,12 +222,16 @@ def read_coco(path: Path, images: Path | None = None) -> Dataset:
         annotations[str(of_image)].append((class_id, box, crowd))
     samples = []
     repeated = 0
+    listed: set[str] = set()
     finder = _ImageFinder(path, images)
     for index, entry in enumerate(_entries(content, "images", path)):
         where = f"{path}, image {index}"
         image_id, file_name = entry.get("id"), entry.get("file_name")
         if type(image_id) not in (int, str) or not isinstance(file_name, str):
             raise DatasetError(f"{where}: expected `id` and `file_name`")
+        if str(image_id) in listed:
+            raise DatasetError(f"{where}: its id {image_id!r:.100} is that of an earlier image")
+        listed.add(str(image_id))
         given = annotations.pop(str(image_id), [])
         seen = _once(given)
         repeated += len(given) - len(seen)
@@ -255,7 +270,8 @@ def _stated_size(entry: dict[str, Any], where: str) -> tuple[int, int] | None:
     size = entry.get("width"), entry.get("height")
     if size == (None, None) or size == (0, 0):
         return None
-    width, height = size
+    # Some programs write whole numbers as 640.0.
+    width, height = (int(side) if isinstance(side, float) and side.is_integer() else side for side in size)
     if type(width) is not int or type(height) is not int or min(width, height) <= 0:
         raise DatasetError(
             f"{where}: width and height must be whole numbers of pixels, got {width!r:.100} and "
@@ -271,25 +287,26 @@ def _entries(content: dict[str, Any], key: str, path: Path) -> list[dict[str, An
     return value
 
 
-def _categories(entries: list[dict[str, Any]], path: Path) -> tuple[tuple[str, ...], dict[Any, int]]:
-    """Names in the order of the file, and the file's ids → their index in it."""
-    ids: dict[Any, int] = {}
+def _categories(entries: list[dict[str, Any]], path: Path) -> tuple[tuple[str, ...], dict[str, int]]:
+    """Names in the order of the file, and the file's ids, as text → their index in it."""
+    ids: dict[str, int] = {}
     names = []
     for index, entry in enumerate(entries):
-        if type(entry.get("id")) is not int or not isinstance(entry.get("name"), str) or entry["id"] in ids:
+        number, name = entry.get("id"), entry.get("name")
+        if type(number) not in (int, str) or not isinstance(name, str) or str(number) in ids:
             raise DatasetError(f"{path}, category {index}: expected a unique `id` and a `name`")
-        ids[entry["id"]] = index
-        names.append(entry["name"])
+        ids[str(number)] = index
+        names.append(name)
     if not names:
         raise DatasetError(f"{path}: has no categories")
     return tuple(names), ids
 
 
 def _annotation(
-    entry: dict[str, Any], ids: dict[Any, int], where: str
+    entry: dict[str, Any], ids: dict[str, int], where: str
 ) -> tuple[int | str, int, tuple[float, ...], bool]:
     category, box = entry.get("category_id"), entry.get("bbox")
-    if type(category) is not int or category not in ids:
+    if type(category) not in (int, str) or str(category) not in ids:
         raise DatasetError(f"{where}: its category_id {category!r:.100} is not in categories")
     if type(entry.get("image_id")) not in (int, str):
         raise DatasetError(f"{where}: has no image_id")
@@ -305,7 +322,7 @@ def _annotation(
     left, top, width, height = box
     return (
         entry["image_id"],
-        ids[category],
+        ids[str(category)],
         (left, top, left + width, top + height),
         bool(entry.get("iscrowd")),
     )
@@ -327,9 +344,13 @@ class _ImageFinder:
         )
 
     def find(self, file_name: str, where: str) -> Path:
+        # Windows writes backslashes, and macOS decomposes letters with marks.
+        slashed = file_name.replace("\\", "/")
+        names = (file_name, slashed, *(unicodedata.normalize(form, slashed) for form in ("NFC", "NFD")))
         for folder in self._folders:
-            if (folder / file_name).is_file():
-                return folder / file_name
+            for name in names:
+                if (folder / name).is_file():
+                    return folder / name
         searched = ", ".join(str(folder) for folder in self._folders)
         raise DatasetError(f"{where}: {file_name} is in none of {searched}; give the folder with --images")
 
@@ -348,6 +369,9 @@ def read_yolo(path: Path, split: str | None = None, class_names: tuple[str, ...]
         table = _read_table(table_path)
         names, images = _names(table, table_path) or class_names, _images_of(table, table_path, split)
         keypoints = _keypoints(table, table_path)
+        count = table.get("nc")
+        if "names" in table and names is not None and type(count) is int and count != len(names):
+            raise DatasetError(f"{table_path}: `nc` is {count}, but `names` has {len(names)} classes")
     if not images:
         raise DatasetError(
             f"{path}: has no images; expected images/ and labels/, or images with label files beside them"
