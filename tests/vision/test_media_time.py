@@ -193,3 +193,12 @@ def test_only_a_discontinuity_changes_the_steps(
     taken_s = [after_s - before_s for before_s, after_s in itertools.pairwise(times_s)]
     assert taken_s == pytest.approx(expected_s, abs=1e-5)
     assert all(math.isfinite(time_s) for time_s in times_s)
+
+
+def test_a_video_that_states_an_implausible_rate_is_complete(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = write_stamped_video(tmp_path / "fast.mkv", [40 * index for index in range(12)], interval_ms=1)
+    with open_source(str(path)) as source:
+        assert len(list(source)) == 12
+    assert "truncated" not in caplog.text

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import os
 import sys
@@ -101,6 +102,25 @@ def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
     with pytest.raises(SourceError, match=r"a\.exr: .*mavlink-companion\[exr\].*32-bit TIFF"):
         decode_depth(tmp_path / "a.exr", b"")
+
+
+@pytest.mark.parametrize("dtype", [">u2", "<u2", ">f4"])
+def test_depth_of_any_byte_order_is_read(dtype: str) -> None:
+    stored = io.BytesIO()
+    np.save(stored, np.full((4, 4), 3000, dtype))
+    depth = decode_depth(Path("a.npy"), stored.getvalue())
+    assert depth is not None
+    np.testing.assert_allclose(to_metres(depth, 0.001), np.full((4, 4), 3.0, np.float32))
+
+
+def test_integers_in_metres_are_refused_with_the_key() -> None:
+    metres = np.full((4, 4), 3, np.uint16)
+    with pytest.raises(SourceError, match=r"0\.003 m.*source\.depth_scale"):
+        to_metres(metres, None)
+    np.testing.assert_array_equal(to_metres(metres, 1.0), metres.astype(np.float32))
+    near = np.zeros((4, 4), np.uint16)
+    near[0] = 3  # most of it unknown: something is at the lens
+    assert np.isnan(to_metres(near, None)[1:]).all()
 
 
 def test_floats_in_millimetres_are_refused_with_the_key() -> None:

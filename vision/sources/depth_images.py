@@ -20,6 +20,8 @@ INTEGER_SCALE_M, FLOAT_SCALE_M = 0.001, 1.0
 """Metres per unit without `depth_scale`: 16-bit integers are millimetres, floats metres."""
 # Floats in millimetres are common, and depth cameras for vehicles do not see this far.
 IMPLAUSIBLE_MEDIAN_M = 200.0
+# Integers in metres: as millimetres all of the image is nearer than any depth camera sees.
+IMPLAUSIBLE_LARGEST_M = 0.03
 # The channel of depth in an OpenEXR file with several, as renderers name it. Files with layers have the
 # layer's name and a dot before it.
 _EXR_CHANNEL = "Z"
@@ -75,6 +77,7 @@ def decode_depth(path: Path, data: bytes) -> NDArray[Any] | None:
         return None
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
+    image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim != 2 or not (image.dtype == np.uint16 or image.dtype.kind == "f"):
         raise SourceError(
             f"{path}: depth must be one channel of 16-bit integers or floats, got shape {image.shape} "
@@ -116,7 +119,8 @@ def to_metres(image: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]
         scale_m: metres per unit; None: by the type, see INTEGER_SCALE_M.
 
     Raises:
-        SourceError: half of a float image is farther than 200 m: it is in another unit.
+        SourceError: it is in another unit: half of a float image is farther than 200 m, or all of an integer
+            image without `scale_m` nearer than 0.03 m.
     """
     integer = image.dtype.kind == "u"
     scale = (INTEGER_SCALE_M if integer else FLOAT_SCALE_M) if scale_m is None else scale_m
@@ -126,6 +130,13 @@ def to_metres(image: NDArray[Any], scale_m: float | None) -> NDArray[np.float32]
     if integer:  # a sensor's "no measurement"
         known &= image != np.iinfo(image.dtype).max
     depth_m[~known] = np.nan
+    if integer and scale_m is None and known.mean() > 0.5:
+        largest_m = float(np.max(depth_m[known]))
+        if largest_m < IMPLAUSIBLE_LARGEST_M:
+            raise SourceError(
+                f"the largest depth is {largest_m:.3f} m; integers are millimetres unless source.depth_scale "
+                f"(metres per unit) says otherwise: for metres set it to 1"
+            )
     if not integer and known.any():
         median_m = float(np.median(depth_m[known]))
         if median_m > IMPLAUSIBLE_MEDIAN_M:

@@ -160,6 +160,9 @@ class VideoFileCapture(Capture):
         self.interval_s = interval_of(self._capture)
         self._grabbed = self._capture.grab()
         self._claimed = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        # By the rate that OpenCV made the number with, however implausible.
+        rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
+        self._claimed_s = self._claimed / rate_hz if rate_hz > 0 else self._claimed * self.interval_s
         # Stamps count from the first frame, but the claimed number of a file may count from 0.
         start_s = self._capture.get(_CAP_PROP_PTS) * self.interval_s
         self._latest_s = self._start_s = max(start_s - self._stamp_s(), 0.0)
@@ -195,7 +198,7 @@ class VideoFileCapture(Capture):
         """
         if not 0 < self._claimed < 1e9:
             return 0
-        missing_s = self._claimed * self.interval_s - self._latest_s - self.interval_s
+        missing_s = self._claimed_s - self._latest_s - self.interval_s
         return int(min(self._claimed - self._delivered, round(missing_s / self.interval_s)))
 
     def close(self) -> None:
