@@ -25,8 +25,8 @@ from companion.peer_data import PeerDataError, parse_object
 from companion.recording import RecordingError
 from companion.recording.frames import DetectedFrame
 from companion.settings import ZenohSection
+from vision.class_names import fold_name
 from vision.detections import TRACK_CONFIRMED, TRACK_TENTATIVE
-from vision.evaluation.datasets import fold_name
 from vision.image_file import decode_image
 from vision.plain_yaml import load_plain_yaml
 from vision.text_file import read_text

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from vision.class_names import fold_name
 from vision.detections import Detections
 from vision.detector import DEFAULT_MODEL, model_path
-from vision.evaluation.datasets import Dataset, DatasetError, fold_name, read_image
+from vision.evaluation.datasets import Dataset, DatasetError, read_image
 from vision.evaluation.misses import WorstMisses
 from vision.pipeline import FrameDetector
 from vision.runtimes.base import Precision
@@ -108,20 +109,20 @@ def map_classes(model_names: Sequence[str], dataset: Dataset) -> ClassMapping:
                 )
         same = np.arange(count)
         return ClassMapping(tuple(model_names), same, same, ())
-    known: dict[str, int] = {}
+    known: dict[str, list[int]] = {}
     for index, name in enumerate(model_names):
-        known.setdefault(fold_name(name), index)
+        known.setdefault(fold_name(name), []).append(index)
     of_model = np.full(len(model_names), -1)
     of_dataset = np.full(len(dataset.class_names), -1)
     names: list[str] = []
     for index, name in enumerate(dataset.class_names):
-        model_index = known.get(fold_name(name))
-        if model_index is None:
+        indices = known.get(fold_name(name))
+        if indices is None:
             continue
-        if of_model[model_index] < 0:
-            of_model[model_index] = len(names)
+        if of_model[indices[0]] < 0:
+            of_model[indices] = len(names)
             names.append(name)
-        of_dataset[index] = of_model[model_index]
+        of_dataset[index] = of_model[indices[0]]
     if not names:
         raise DatasetError(
             f"{dataset.root}: no class in common with the model: found {_few(dataset.class_names)}; "

@@ -21,8 +21,9 @@ from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
 from companion.training_display import TrainingDisplay
 from mavlink_sim.datasets.training_scenes import random_scene, training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
+from vision.class_names import fold_name
 from vision.detector import DEFAULT_MODEL, RENDERED_SCENES, Detector
-from vision.evaluation.datasets import Dataset, DatasetError, MissingSplitError, fold_name, open_dataset
+from vision.evaluation.datasets import Dataset, DatasetError, MissingSplitError, open_dataset
 from vision.model_files import find_model
 from vision.runtimes.base import bfloat16_instructions
 from vision.weights import DEFAULT_WEIGHTS

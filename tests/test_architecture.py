@@ -155,6 +155,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.calibration.boards",
     "vision.calibration.camera_info",
     "vision.camera_model",
+    "vision.class_names",
     "vision.depth_registration",
     "vision.extras",
     "vision.frame",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.class_names import class_named, joined_names
 from vision.detections import Detections
 from vision.registry import Registry
 
@@ -159,22 +159,26 @@ def detector(kind: str, help_text: str) -> Callable[[_Opener], _Opener]:
 
 
 def resolve_classes(classes: Sequence[str | int], class_names: Sequence[str]) -> tuple[int, ...]:
-    """Class names or ids (also ids as text) → sorted ids.
+    """Class names or ids (also ids as text) → sorted ids; names as `class_named` reads them.
 
-    Raises `ValueError` for an unknown one; the message names the closest matches.
+    Raises `ValueError` for an unknown or ambiguous one; the message names the closest matches.
     """
     if isinstance(classes, str) or not classes:
         raise ValueError(f"classes must be a list of names or ids, or None for all; got {classes!r}")
     ids: set[int] = set()
-    for wanted in classes:
-        named = [index for index, name in enumerate(class_names) if name == wanted]
-        if not named and isinstance(wanted, str) and not wanted.isdecimal():
-            near = difflib.get_close_matches(wanted.lower(), class_names, n=3, cutoff=0.0)
-            raise ValueError(
-                f"the model has no class {wanted!r}; nearest of its {len(class_names)}: {', '.join(near)}"
-            )
-        identity = int(wanted) if not named else named[0]
-        if not 0 <= identity < len(class_names):
-            raise ValueError(f"the model has classes 0..{len(class_names) - 1}, not {wanted}")
-        ids.update(named or [identity])
+    for number in (wanted for wanted in classes if not isinstance(wanted, str)):
+        if not 0 <= number < len(class_names):
+            raise ValueError(f"the model has classes 0..{len(class_names) - 1}, not {number}")
+        ids.add(number)
+    for wanted in joined_names([wanted for wanted in classes if isinstance(wanted, str)], class_names):
+        try:
+            name = class_named(wanted, class_names)
+        except ValueError as error:
+            if not wanted.isdecimal():
+                raise ValueError(f"{error} (the model has {len(class_names)} classes)") from None
+            if not int(wanted) < len(class_names):
+                raise ValueError(f"the model has classes 0..{len(class_names) - 1}, not {wanted}") from None
+            ids.add(int(wanted))
+        else:
+            ids.update(index for index, each in enumerate(class_names) if each == name)
     return tuple(sorted(ids))

@@ -16,7 +16,6 @@ loaded only if the setting `plugins.modules` names it (`companion.plugins`).
 
 from __future__ import annotations
 
-import difflib
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -28,6 +27,7 @@ from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.chosen import GimbalGoal
+from vision.class_names import class_named, near_names
 from vision.registry import RegistrationError
 
 MOST_POINTS = 500
@@ -143,18 +143,23 @@ Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | 
 
 
 def names_in(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list of names."""
-    return tuple(name.strip() for name in text.split(","))
+    """Split a comma-separated list of names; `\\,` is a comma of a name."""
+    return tuple(name.replace("\\,", ",").strip() for name in re.split(r"(?<!\\),", text))
+
+
+def names_text(names: Iterable[str]) -> str:
+    """A list of names, for `names_in`."""
+    return ",".join(name.replace(",", "\\,") for name in names)
 
 
 def known_class(text: str, class_names: Sequence[str]) -> str:
     """The detector's spelling of a class name. Raises GrammarError that suggests the nearest names."""
-    if text in class_names:
-        return text
-    for name in class_names:
-        if _plain(name) == _plain(text):
-            return name
-    raise GrammarError(f"unknown class {text!r}; {nearest(_plain(text), list(class_names))}")
+    try:
+        return class_named(text, class_names)
+    except ValueError as error:
+        # It could be an object's track, or a class's number in the model.
+        hint = "; a number is no class here: track=N is an object" if text.isdecimal() else ""
+        raise GrammarError(f"{error}{hint}") from None
 
 
 def check(word: str, argument: Argument, value: Any, default: Any) -> None:
@@ -212,17 +217,7 @@ def range_of(argument: Number) -> str:
 
 def nearest(word: str, known: list[str]) -> str:
     """Suggest known words close to an unknown one, or list the known words."""
-    # At 0.6, `launch` is close to `land`.
-    plain = {_plain(name): name for name in known}
-    near = [plain[match] for match in difflib.get_close_matches(_plain(word), list(plain), 3, 0.65)]
-    if near:
-        return f"did you mean {' or '.join(near)}?"
-    more = ", …" if len(known) > 12 else ""
-    return f"known: {', '.join(known[:12])}{more}"
-
-
-def _plain(name: str) -> str:
-    return " ".join(re.split(r"[\s_-]+", name.strip().lower()))
+    return near_names(word, known)
 
 
 @dataclass(frozen=True, slots=True)

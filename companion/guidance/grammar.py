@@ -4,7 +4,8 @@
     argument = value | key "=" value          values without a key fill the arguments in order
     value    = bare word | "quoted, with spaces"
 
-Class names are case-insensitive, and `_` and `-` count as a space: `traffic_light` is "traffic light". A
+Class names are read without case, spaces, `_` and `-`: `traffic_light` is "traffic light". In a list of
+classes, a comma of a name is `\\,`, which may be left out where the detector's classes are known. A
 number may be followed by its unit: `distance=3m`. Every command is a frozen dataclass whose fields declare
 key, unit and allowed range, so a command made in code has the same limits, and
 `parse(str(command)) == command`.
@@ -39,9 +40,11 @@ from companion.guidance.command import (
     known_class,
     make_stated,
     names_in,
+    names_text,
     nearest,
     range_of,
 )
+from vision.class_names import joined_names
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
@@ -284,6 +287,8 @@ def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] 
             return text
         case ClassNames():
             names = names_in(text)
-            return ",".join(names if class_names is None else (known_class(n, class_names) for n in names))
+            if class_names is not None:
+                names = tuple(known_class(name, class_names) for name in joined_names(names, class_names))
+            return names_text(names)
         case ClassName():
             return text if class_names is None else known_class(text, class_names)

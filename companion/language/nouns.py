@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 from collections.abc import Sequence
 
 # Everyday name → classes of COCO and of the bundled model. Those that the detector lacks are left out.
@@ -50,7 +51,7 @@ def classes_of(noun: str, class_names: Sequence[str]) -> tuple[str, ...]:
 
 def _forms(class_name: str) -> tuple[str, ...]:
     """A class in the singular and the plural, lower case."""
-    name = " ".join(re.split(r"[\s_-]+", class_name.lower()))
+    name = " ".join(re.split(r"[\s_-]+", unicodedata.normalize("NFC", class_name).lower()))
     if name.endswith(("s", "sh", "ch", "x")):
         return name, f"{name}es"
     if re.search(r"[^aeiou]y$", name):

@@ -10,6 +10,7 @@ with a condition that no command expresses is refused, not shortened. What is am
 from __future__ import annotations
 
 import re
+import unicodedata
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -115,7 +116,11 @@ def understand(text: str, scene: Scene, done: int | None = None) -> Reading:
 
 
 def _plain(text: str) -> str:
-    text = re.sub(r"[^\w\s.,;:/°'=-]", " ", text.lower()).replace("'s", " is").replace("'", "")
+    text = (
+        re.sub(r"[^\w\s.,;:/°'=-]", " ", unicodedata.normalize("NFC", text).lower())
+        .replace("'s", " is")
+        .replace("'", "")
+    )
     text = re.sub(r"(?<!\d)\.(?!\d)|(?<=\d)\.(?!\d)", " ", text) if text.count(".") else text
     text = " ".join(text.split()).strip(" ,;:")
     text = re.sub(r"\b(take off|launch|lift off) and (?:climb|go up|hover)\b", r"\1", with_numbers(text))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from companion.guidance.command import COMMANDS, Command, GrammarError, nearest
+from companion.guidance.command import COMMANDS, Command, GrammarError, known_class, nearest
 from companion.guidance.grammar import parse
 from companion.language.clauses import QUESTIONS, Question
 
@@ -176,7 +176,9 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
     given = {key: value for key, value in arguments.items() if value is not None}
     if call.name in QUESTIONS:
         about = given.get("class", "")
-        return Question(call.name, (about,) if about and isinstance(about, str) else ())
+        if not about or not isinstance(about, str):
+            return Question(call.name)
+        return Question(call.name, (about if class_names is None else known_class(about, class_names),))
     if call.name not in COMMANDS:
         known = [word for word in COMMANDS if word not in _NOT_FOR_MODELS]
         raise GrammarError(f"unknown command {call.name[:80]!r}; {nearest(call.name[:80], known)}")

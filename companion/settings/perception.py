@@ -22,6 +22,7 @@ from vision.camera_model import (
     pixels_without_rays,
     scaled_to_frames,
 )
+from vision.class_names import fold_name
 from vision.frame import Frame
 from vision.frame_selection import Selection
 from vision.home import expanded
@@ -368,9 +369,9 @@ class DetectorSection(Section):
         return Selection(self.every, self.rate_hz, self.max_age_s)
 
     def heights(self) -> dict[str, float]:
-        """Return class name → metres."""
+        """Return class name, as of `fold_name`, → metres."""
         pairs = (text.rpartition(":") for text in self.class_heights_m)
-        return {name: float(height) for name, _, height in pairs}
+        return {fold_name(name): float(height) for name, _, height in pairs}
 
 
 class TrackerSection(Section):

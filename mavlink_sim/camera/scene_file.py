@@ -35,6 +35,7 @@ from mavlink_sim.world.world import (
     demo_world,
 )
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
+from vision.class_names import class_named
 from vision.marker_dictionaries import dictionary_named
 from vision.text_file import read_text
 
@@ -51,11 +52,10 @@ def _one_of(names: Iterable[str]) -> AfterValidator:
     known = tuple(names)
 
     def check(name: str) -> str:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            raise ValueError(f"must be one of {', '.join(known)}{hint}")
-        return name
+        try:
+            return class_named(name, known)
+        except ValueError as error:
+            raise ValueError(f"must be one of {', '.join(known)} ({error})") from None
 
     return AfterValidator(check)
 

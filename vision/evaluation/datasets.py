@@ -150,11 +150,6 @@ class Dataset:
     samples: tuple[Sample, ...]
 
 
-def fold_name(name: str) -> str:
-    """A class name without case, spaces, `_` and `-`: equal for names of the same class."""
-    return "".join(name.casefold().replace("_", " ").replace("-", " ").split())
-
-
 def image_files(folder: Path) -> list[Path]:
     """Every image below `folder`, by name, without hidden files and folders."""
     return sorted(_images_below(folder))
@@ -417,9 +412,13 @@ def _read_table(path: Path) -> dict[Any, Any]:
 def _names(table: dict[Any, Any], path: Path) -> tuple[str, ...] | None:
     names = table.get("names")
     if isinstance(names, dict):
-        names = numbered(names)
+        given = names
+        names = numbered(given)
         if names is None:
-            raise DatasetError(f"{path}: the class names are not numbered from 0")
+            missing = next(
+                (index for index in range(len(given)) if not given.keys() & {index, str(index)}), 0
+            )
+            raise DatasetError(f"{path}: the class names are not numbered from 0: {missing} is missing")
     if names is None:
         return None
     if not isinstance(names, list) or not names:

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from vision.class_names import fold_name
 from vision.detections import Detections
-from vision.evaluation.datasets import Dataset, fold_name, read_image
+from vision.evaluation.datasets import Dataset, read_image
 from vision.letterbox import fit_into
 from vision.tracking.association import overlaps
 from vision.yolo.architecture import YoloModel, build

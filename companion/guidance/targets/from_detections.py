@@ -37,6 +37,7 @@ from companion.vehicle.gimbal import YawFrame
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import slerp, turned_about_down
 from vision.camera_model import CameraModel, CameraMount
+from vision.class_names import fold_name
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.geolocation import PixelRays, range_from_known_height
 from vision.rotation import matrix_from_quaternion
@@ -228,7 +229,7 @@ def targets_from_detections(
     and the range is that of the ground at the ray through its lower edge, less `CONTACT_INSET_M`. The
     ground is assumed flat, at the level below the vehicle (`VehicleState.ground`) or else of home. That gives
     no range if the box touches the image's lower edge, or the ray points less than 2° down; then the class's
-    height in `heights_m` is used, if the box is not cut off at its top or bottom.
+    height in `heights_m` (by `fold_name`) is used, if the box is not cut off at its top or bottom.
 
     A detection that has a similar score as another class is not `trusted`: a car that may be a truck is not
     flown to.
@@ -249,7 +250,7 @@ def targets_from_detections(
             camera,
             mount,
             pose,
-            height_m=heights_m.get(detection["class_name"]),
+            height_m=heights_m.get(fold_name(detection["class_name"])),
             trusted=not doubtful,
         )
         for detection, sight, doubtful in zip(detections, sights, ambiguous, strict=True)

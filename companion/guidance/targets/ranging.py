@@ -11,6 +11,7 @@ import numpy as np
 
 from companion.guidance.targets.from_detections import MIN_DEPRESSION_RAD
 from vision.camera_model import CameraModel
+from vision.class_names import fold_name
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +21,7 @@ class RangeMeans:
     Attributes:
         depth: depth was received.
         ground: its image shows the ground when the vehicle is level above it.
-        classes: those with a known height (`detector.class_heights_m`).
+        classes: those with a known height (`detector.class_heights_m`), as of `fold_name`.
     """
 
     depth: bool = True
@@ -31,7 +32,7 @@ class RangeMeans:
         """What is missing for the range of these classes, in words; None: nothing."""
         if self.depth or self.ground:
             return None
-        unknown = [name for name in class_names if name not in self.classes]
+        unknown = [name for name in class_names if fold_name(name) not in self.classes]
         if not unknown:
             return None
         return (

@@ -158,7 +158,7 @@ def test_class_heights_are_metres_by_class() -> None:
     text = "person:1.7,dining table:0.75"
     assert load_settings(overrides={"detector.class_heights_m": text}, environment={}).detector.heights() == {
         "person": 1.7,
-        "dining table": 0.75,
+        "diningtable": 0.75,
     }
     (line,) = problems(overrides={"detector.class_heights_m": "person:0"})
     assert "class_heights_m: person " in line
