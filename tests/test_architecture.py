@@ -158,6 +158,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.class_names",
     "vision.depth_registration",
     "vision.extras",
+    "vision.file_kinds",
     "vision.frame",
     "vision.geolocation",
     "vision.gc_pause",

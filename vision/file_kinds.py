@@ -5,7 +5,11 @@ Each reader puts it in place of its own error, which would say only what its par
 
 from __future__ import annotations
 
+import errno
+import os
 import re
+import stat
+from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
 
@@ -190,3 +194,12 @@ def _zip_kind(head: bytes) -> str:
     if name.endswith(b".npy"):
         return "is an archive of NumPy arrays"
     return "is a zip archive: unpack it and give the file that is in it"
+
+
+def open_file(path: Path) -> BufferedReader:
+    """Open a file for reading. Raises OSError, also for a pipe, where opening would wait for its writer."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if stat.S_ISFIFO(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.ESPIPE, "is a pipe, give a file", str(path))
+    return open(descriptor, "rb")

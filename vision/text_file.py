@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import codecs
+import errno
+import os
+import stat
 from pathlib import Path
 
 _UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
@@ -19,8 +22,20 @@ class NotUtf8Error(UnicodeDecodeError):
 
 
 def read_text(path: Path) -> str:
-    """The text of a file, without its byte order mark; raises OSError or NotUtf8Error."""
-    return decode_text(path.read_bytes())
+    """The text of a file, without its byte order mark.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe without a writer. NotUtf8Error.
+    """
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(descriptor, "rb", buffering=0) as file:
+        if not stat.S_ISFIFO(os.fstat(descriptor).st_mode):
+            return decode_text(file.readall())
+        # `<(…)` of a shell is a pipe with a writer; one without a writer would be waited for for ever.
+        if (first := file.read(1)) == b"":
+            raise OSError(errno.EPIPE, "is a pipe that nobody writes to", str(path))
+        os.set_blocking(descriptor, True)
+        return decode_text((first or b"") + file.readall())
 
 
 def decode_text(data: bytes) -> str:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from vision.file_kinds import explained
+from vision.text_file import read_text
 
 ROUNDS = 5
 _WARM_UP = 8
@@ -217,7 +218,7 @@ def table(result: dict[str, Any], against: dict[str, Any] | None = None) -> list
 def read_result(path: Path) -> dict[str, Any]:
     """An earlier result, as `--json` printed it. Raises `BenchError`."""
     try:
-        result = json.loads(path.read_text())
+        result = json.loads(read_text(path))
     except OSError as error:
         raise BenchError(f"{path}: cannot be read: {error.strerror}") from error
     except ValueError as error:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
 from companion.passing import PassingError
 from companion.settings import ZenohSection
+from vision.file_kinds import open_file
 from vision.redaction import redacted
 
 
@@ -80,7 +82,10 @@ def zenoh_config(settings: ZenohSection) -> zenoh.Config:
 def read_config_file(setting: str, path: str) -> zenoh.Config:
     """Read a configuration file of zenoh, named by a setting. Raises BusError."""
     try:
+        open_file(Path(path)).close()  # zenoh would wait for the writer of a pipe
         return zenoh.Config.from_file(path)
+    except OSError as error:
+        raise BusError(f"zenoh.{setting} {path}: cannot be read: {error.strerror}") from error
     except zenoh.ZError as error:
         raise BusError(f"zenoh.{setting} {path}: {first_line(error)}") from error
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from companion.key_files import KeyFileError, check_private
+from vision.file_kinds import open_file
 
 HEADER = "x-companion-dashboard"
 """A POST needs it, with any value: a page of another origin cannot send it without a CORS permission."""
@@ -59,7 +60,7 @@ def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             status = os.fstat(file.fileno())
             content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
     except OSError as error:

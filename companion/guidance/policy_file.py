@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from companion.guidance.policy_network import Network, NetworkError, read_network
-from vision.file_kinds import explained
+from vision.file_kinds import explained, open_file
 
 _Format = Literal["mavlink-companion.policy.v1"]
 FORMAT: _Format = "mavlink-companion.policy.v1"
@@ -128,7 +128,8 @@ def load_policy(path: Path) -> LoadedPolicy:
         size = path.stat().st_size
         if size > LARGEST_BYTES:
             raise PolicyError(f"{path}: a policy has at most {LARGEST_BYTES} bytes, this file has {size}")
-        content = path.read_bytes()
+        with open_file(path) as file:
+            content = file.read()
     except OSError as error:
         raise PolicyError(f"{path}: cannot be read: {error}") from error
     try:

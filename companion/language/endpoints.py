@@ -14,7 +14,7 @@ from companion.key_files import KeyFileError, check_private
 from companion.language.tools import MAX_CALLS, ToolCall, arguments_of, calls_of
 from companion.settings import LanguageSection
 from vision.extras import install_command
-from vision.file_kinds import kind_of_bytes
+from vision.file_kinds import kind_of_bytes, open_file
 from vision.redaction import redacted
 from vision.text_file import decode_text
 
@@ -87,7 +87,8 @@ def read_api_key(path: Path) -> str:
     """Read `language.key_file`, a text that only its owner can read. Raises LanguageError."""
     try:
         check_private(path, path.stat())
-        content = path.read_bytes()
+        with open_file(path) as file:
+            content = file.read()
         if (kind := kind_of_bytes(content)) is not None:
             raise LanguageError(f"language.key_file {path}: {kind}")
         key = decode_text(content).strip()

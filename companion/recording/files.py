@@ -22,7 +22,7 @@ from mcap.stream_reader import breakup_chunk
 from mcap.writer import CompressionType, Writer
 
 from companion.recording import RecordingError
-from vision.file_kinds import explained
+from vision.file_kinds import explained, open_file
 
 MAGIC = b"\x89MCAP0\r\n"
 PROFILE = "companion"
@@ -252,7 +252,7 @@ class RecordingReader:
         self.ended = True
         self.metadata: dict[str, dict[str, str]] = {}
         try:
-            with path.open("rb") as file:
+            with open_file(path) as file:
                 begin = file.read(len(MAGIC))
                 self._size = os.fstat(file.fileno()).st_size
         except OSError as error:
@@ -281,7 +281,7 @@ class RecordingReader:
 
     def _records(self) -> Iterator[Schema | ChannelRecord | Message]:
         at = len(MAGIC)
-        with self.path.open("rb") as file:
+        with open_file(self.path) as file:
             file.seek(at)
             while True:
                 header = file.read(_HEADER_BYTES)

@@ -24,6 +24,7 @@ from companion.recording import RecordingError
 from companion.recording.boot_clock import LOGGED, Alignment, align, read_boots
 from companion.recording.convert import LOG_CHANNEL, ULOG_NAME, foxglove_message, log_body
 from companion.recording.files import Channel, Recorded, RecordingReader, write_messages
+from vision.file_kinds import open_file
 
 _BLOCK = 1000  # messages converted at once
 _LATEST_US = 10**15  # 31 years; a later stamp is damage
@@ -84,6 +85,7 @@ def merge_ulog(path: Path, ulog_path: Path, output: Path) -> Merged:
 def _read(path: Path) -> ULog:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # it prints what `file_corruption` says
+            open_file(path).close()  # it would wait for the writer of a pipe
             return ULog(str(path))
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error

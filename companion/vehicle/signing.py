@@ -17,7 +17,7 @@ from pathlib import Path
 from companion.key_files import KeyFileError, check_private
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
-from vision.file_kinds import kind_of_bytes
+from vision.file_kinds import kind_of_bytes, open_file
 from vision.text_file import decode_text
 
 logger = logging.getLogger(__name__)
@@ -48,7 +48,7 @@ def read_key(path: str | Path) -> bytes:
     """
     path = Path(path)
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             status = os.fstat(file.fileno())
             content = file.read(MAX_KEY_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
     except OSError as error:

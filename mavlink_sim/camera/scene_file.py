@@ -36,6 +36,7 @@ from mavlink_sim.world.world import (
 )
 from vision.camera_model import CameraModel, CameraMount, DistortionModel, check_distortion
 from vision.class_names import class_named
+from vision.file_kinds import explained
 from vision.marker_dictionaries import dictionary_named
 from vision.text_file import read_text
 
@@ -222,13 +223,16 @@ def load_scene(file: str | FilePath) -> Scene:
     try:
         text = read_text(path)
     except UnicodeDecodeError as error:
-        raise SceneError(f"{path}: {error}") from error
+        raise SceneError(explained(path, f"{path}: {error}")) from error
     except OSError as error:
         known = ", ".join(example_scenes())
         raise SceneError(
             f"cannot read the scene file {path}: {error.strerror}; scenes in the package: {known}"
         ) from error
-    return parse_scene(text, str(path))
+    try:
+        return parse_scene(text, str(path))
+    except SceneError as error:
+        raise SceneError(explained(path, str(error))) from error
 
 
 def scene_or_demo(file: str | FilePath | None, seed: int) -> Scene:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import ast
+import os
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
+from vision.file_kinds import open_file
 from vision.text_file import NotUtf8Error, read_text
 
 ROOT = Path(__file__).parents[2]
@@ -45,3 +48,19 @@ def test_text_files_are_read_in_one_place() -> None:
                     found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
     # A device tree is the kernel's.
     assert [place for place in found if "stored_choice" not in place] == []
+
+
+def test_pipe_without_a_writer_is_an_error_and_one_with_a_writer_is_read(tmp_path: Path) -> None:
+    os.mkfifo(path := tmp_path / "settings.toml")
+    with pytest.raises(OSError, match="pipe"):
+        read_text(path)
+    with pytest.raises(OSError, match="pipe"):
+        open_file(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    writer = os.open(path, os.O_WRONLY)
+    with ThreadPoolExecutor() as pool:
+        read = pool.submit(read_text, path)
+        os.write(writer, "\ufeffa = 1\n".encode())
+        os.close(writer)
+        assert read.result(timeout=10) == "a = 1\n"
+    os.close(reader)

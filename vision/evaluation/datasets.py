@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision import image_file
-from vision.file_kinds import explained, is_hidden
+from vision.file_kinds import explained, is_hidden, open_file
 from vision.image_file import is_image
 from vision.plain_yaml import PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
@@ -191,7 +191,7 @@ def find_annotations(folder: Path, split: str | None = None) -> Path | None:
 
 def _looks_like_coco(path: Path) -> bool:
     """Check the keys at the beginning and end of the file: annotation files can be large."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         seen = file.read(1 << 16)
         file.seek(max(0, path.stat().st_size - (1 << 16)))
         seen += file.read()

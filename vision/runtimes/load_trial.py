@@ -14,6 +14,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from vision.file_kinds import open_file
 from vision.runtimes.base import RuntimeName, RuntimeUnusableError, required, version
 from vision.runtimes.stored_choice import cache_folder
 from vision.weights import DEFAULT_EXPORT
@@ -75,7 +76,7 @@ def _digest(path: Path, runtime: RuntimeName) -> str:
     """Return what identifies the file and the runtime that loads it."""
     digest = hashlib.sha256()
     for each in _files(path):
-        with each.open("rb") as file:
+        with open_file(each) as file:
             digest.update(hashlib.file_digest(file, "sha256").digest())
     digest.update(version(runtime).encode())
     return digest.hexdigest()[:32]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from vision.file_kinds import open_file
 from vision.foreign.layouts import ForeignFacts, Port, recognise
 from vision.plain_yaml import PlainYamlError, load_plain_yaml
 from vision.runtimes import base
@@ -190,7 +191,7 @@ def _check_head(path: Path) -> None:
     if path.suffix != SUFFIXES["openvino"]:
         return
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(1024)
     except OSError as error:
         raise RuntimeUnusableError(f"{path}: cannot be read ({error.strerror or error})") from None

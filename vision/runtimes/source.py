@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from vision.extras import install_command
-from vision.file_kinds import explained, is_hidden, wrong_file
+from vision.file_kinds import explained, is_hidden, open_file, wrong_file
 from vision.foreign.layouts import YOLOX_SUFFIX, ForeignFacts
 from vision.model_files import missing_model_advice
 from vision.runtimes.base import (
@@ -169,7 +169,7 @@ def check_model_file(path: Path, runtime: RuntimeName | Literal["auto"] | None) 
     if kind is not None and (what := wrong_file(path, *_FITTING)) is not None:
         raise RuntimeUnusableError(what)
     if kind is None and len(files) == 1:
-        with path.open("rb") as opened:
+        with open_file(path) as opened:
             if opened.read(2) != b"PK":  # the zip archive of torch.save
                 problem = f"{path}: neither a checkpoint nor an exported model"
                 raise CheckpointError(explained(path, problem))

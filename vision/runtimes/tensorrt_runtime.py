@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vision.extras import install_command
+from vision.file_kinds import open_file
 from vision.runtimes.base import Precision, RuntimeMissingError, RuntimeName, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, ExportedFacts, split_facts
 from vision.yolo.level_outputs import Head, LevelOutput, Product
@@ -199,7 +200,8 @@ def tensorrt_facts(path: Path) -> ExportedFacts:
 
 def _read(path: Path) -> tuple[ExportedFacts, memoryview]:
     try:
-        content = path.read_bytes()
+        with open_file(path) as file:
+            content = file.read()
     except OSError as error:
         raise RuntimeUnusableError(f"{path}: cannot be read: {error.strerror}") from error
     return split_facts(content, path)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from safetensors import SafetensorError, safe_open
 
-from vision.file_kinds import explained
+from vision.file_kinds import explained, open_file
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
 from vision.yolo.safe_pickle import CheckpointError, one_line
@@ -115,7 +115,7 @@ def write_pair(
 
 def file_sha256(path: Path) -> str:
     """The file's SHA-256, 64 hexadecimal digits."""
-    with path.open("rb") as file:
+    with open_file(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -200,7 +200,7 @@ def read_safetensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         CheckpointError: the file is missing, truncated, or invalid.
     """
     try:
-        with path.open("rb") as file:
+        with open_file(path) as file:
             size, length = os.fstat(file.fileno()).st_size, int.from_bytes(file.read(8), "little")
         if size >= 8 and length > _MAX_HEADER_BYTES:
             raise CheckpointError(

@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 import torch
 from torch import Tensor
 
-from vision.file_kinds import explained
+from vision.file_kinds import explained, open_file
 from vision.model_files import missing_model_advice
 from vision.yolo.safe_pickle import (
     AllowedGlobal,
@@ -154,7 +154,7 @@ def read_archive(path: str | Path) -> Any:
 
 def _read(path: Path) -> Any:
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_file(path) as file:
         if size == 0:
             raise CheckpointError("the file is empty; copy or download it again")
         if file.read(2) != b"PK":

@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
+import struct
+import subprocess
+import sys
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -13,10 +17,12 @@ import cv2
 import numpy as np
 import pytest
 import typer.main
+from pymavlink.dialects.v20 import common as mavlink
 
 from companion.cli import app
 from companion.recording.files import write_messages
 from companion.settings.reading import flags
+from mavlink_sim.camera.scene_file import SceneError, load_scene
 from tests.companion.command_line import companion_here
 from vision.calibration.camera_info import write_camera_info
 from vision.camera_model import CameraModel
@@ -110,6 +116,8 @@ def make_wrong(folder: Path, kind: str, suffix: str) -> Path:
         path.mkdir()
     elif kind == "unreadable":
         path.symlink_to(path.name)  # a loop: unreadable for root too
+    elif kind == "fifo":
+        os.mkfifo(path)  # nobody writes to it
     elif kind == "device":
         path.symlink_to("/dev/null")
     elif kind == "zip":
@@ -119,6 +127,13 @@ def make_wrong(folder: Path, kind: str, suffix: str) -> Path:
     elif kind != "missing":
         _write(path, CONTENTS[kind])
     return path
+
+
+def _tlog() -> bytes:
+    """Telemetry as ground stations log it: each message after eight bytes of time, microseconds."""
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    frame = sender.heartbeat_encode(2, 12, 0, 0, 3).pack(sender)
+    return b"".join(struct.pack(">Q", 1_700_000_000_000_000 + 1000 * n) + frame for n in range(50))
 
 
 CONTENTS = {
@@ -135,8 +150,12 @@ CONTENTS = {
     "plan": json.dumps(_PLAN).encode(),
     "waypoints": b"QGC WPL 110\n0\t1\t0\t16\t0\t0\t0\t0\t47.4\t8.5\t488\t1\n",
     "line": b"a" * 3_000_000,
+    "sqlite": b"SQLite format 3\0" + bytes(4080),
+    "bag": b"#ROSBAG V2.0\nE\0\0\0" + bytes(4000),
+    "ulog": b"ULog\x01\x12\x35\x01" + bytes(200),
+    "tlog": _tlog(),
 }
-KINDS = (*CONTENTS, "zip", "folder", "missing", "unreadable", "device")
+KINDS = (*CONTENTS, "zip", "folder", "missing", "unreadable", "device", "fifo")
 
 # Other parameters that are text or paths: written, not read; or no files.
 WRITTEN = {
@@ -160,7 +179,9 @@ _IMAGES = {
     for name, rows in READERS.items()
     if name.endswith((" source", " colour", " infrared")) and not name.startswith("models")
 }
-ACCEPTED: dict[str, set[str]] = _IMAGES | {
+# To a pipe somebody may write later.
+ACCEPTED: dict[str, set[str]] = {name: kinds | {"fifo"} for name, kinds in _IMAGES.items()} | {
+    "source.depth": {"fifo"},
     "config": {"empty", "device"},
     "vehicle.signing_key_file": {"toml", "json"},
     "language.key_file": {"toml", "json", "line"},
@@ -241,3 +262,48 @@ def test_a_wrong_file_is_one_line(
         path.rmdir() if kind == "folder" else path.unlink(missing_ok=True)
     assert not faults
     assert capfd.readouterr().err == ""  # of libraries that write to standard error themselves
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_wrong_scene_is_one_line(kind: str, tmp_path: Path) -> None:
+    path = make_wrong(tmp_path, kind, ".toml")
+    if kind in ("empty", "device"):  # a scene of defaults
+        assert load_scene(path).world.objects == ()
+        return
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    lines = str(caught.value).splitlines()
+    assert all("given.toml" in line for line in lines)
+    assert len(lines) == 1 or kind == "toml"
+    assert not _FOREIGN.search(str(caught.value))
+    said = {"plan": "QGroundControl", "lfs": "git lfs pull", "html": "HTML page", "sqlite": "ROS 2"}
+    assert said.get(kind, "") in lines[0]
+
+
+@pytest.mark.parametrize("command", ["companion.cli play", "mavlink_sim"])
+def test_programs_name_a_wrong_scene(command: str, tmp_path: Path) -> None:
+    path = make_wrong(tmp_path, "plan", ".toml")
+    words = [sys.executable, "-m", *command.split(), "--scene", path.name]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "given.toml" in line
+    assert "QGroundControl" in line
+
+
+@pytest.mark.parametrize(
+    "command", ["models info {}", "detect frame.png --model {}", "train --data labelled --steps 1 --from {}"]
+)
+def test_a_checkpoint_of_classification_says_what_it_is(
+    command: str, right: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("torch")
+    from tests.vision.foreign_checkpoints import foreign_classes, save_foreign
+
+    classes = foreign_classes(monkeypatch, {"ClassificationModel": "ultralytics.nn.tasks"})
+    save_foreign(right / "given.pt", classes["ClassificationModel"]())
+    done = companion_here(*(word.replace("{}", "given.pt") for word in command.split()), cwd=right)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert "given.pt" in line
+    assert "classification" in line
