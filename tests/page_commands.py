@@ -26,13 +26,12 @@ KEPT = (
     ("ffmpeg -i", "service", "| companion run", "up: camera"),
     ("companion dashboard", "dashboard", "", ""),
     ("companion mcp --listen", "tools", "", "mcp: http://"),
+    ("mavlink-sim --", "vehicle", "--camera", "is on"),
     ("mavlink-sim --", "vehicle", "", ""),
 )
 AFTER_FLIGHT = ("companion replay", "companion collect")  # the page ends the service before
-WATCHED = (  # prints without end, or flies long: other tests fly
-    "companion echo",
-    "companion markers shm://",
-    "companion preview shm://",
+PRINTS = ("companion echo", "companion markers shm://", "companion preview shm://")  # without end
+WATCHED = (  # waits, or flies long: other tests fly
     "companion collect myset --",
     'companion ask "find ',
     'companion send "goto ',
@@ -98,12 +97,17 @@ def failures(lines: Sequence[str]) -> Iterator[str]:
                     yield report(line, "not ready", terminal)
                 break
         else:
-            watched = line.startswith(WATCHED)
+            watched = line.startswith(PRINTS + WATCHED)
             if line.startswith(AFTER_FLIGHT) and not watched:
                 yield from end("service")
             terminal = open_terminal(line)
             if line.startswith(ASKS):
                 answer(terminal)
+            if line.startswith(PRINTS):
+                try:
+                    terminal.wait_for_line("", COMMAND_S)
+                except TimeoutError:
+                    yield report(line, "prints nothing", terminal)
             try:
                 code = terminal.process.wait(WATCHED_S if watched else COMMAND_S)
             except subprocess.TimeoutExpired:

@@ -29,6 +29,8 @@ SETUP = 'ip link set lo up && mount -t tmpfs none /dev/shm && exec "$@"'
 
 NOT_RUN = {
     "/dev/video": "a camera",
+    "/dev/v4l/": "a camera",
+    "csi://0": "a camera",
     "companion calibrate photos": "photographs of a printed board",
     "companion calibrate extrinsics colour": "images of two cameras",
     "companion markers images/": "photographs of a marker",
@@ -46,7 +48,6 @@ PAGES_NOT_RUN = {
     "README.md": "make, pip; images, video and a SITL of the reader",
     "CONTRIBUTING.md": "make runs the tests",
     "formation.md": "a fleet and a benchmark",
-    "cameras.md": "cameras, pipes and folders of images",
     "campaigns.md": "a Ray cluster",
     "environments.md": "compiles the simulator",
     "install.md": "pip and downloads",
