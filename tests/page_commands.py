@@ -23,7 +23,7 @@ KEPT = (
     ("companion run", "service", "shm://", "up: autopilot"),
     ("companion run", "service", "", "ready: commands on"),
     ("companion view", "service", "", "up: camera"),
-    ("ffmpeg -i", "service", "| companion run", "up: camera"),
+    ("ffmpeg ", "service", "| companion run", "perception running"),
     ("companion dashboard", "dashboard", "", ""),
     ("companion mcp --listen", "tools", "", "mcp: http://"),
     ("mavlink-sim --", "vehicle", "--camera", "is on"),
