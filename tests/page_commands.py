@@ -35,9 +35,9 @@ WATCHED = (  # waits, or flies long: other tests fly
     "companion collect myset --",
     'companion ask "find ',
     'companion send "goto ',
-    "companion send 'formation ",
+    "companion send --vehicle-name vehicle2 'formation ",
 )
-WATCHED_S = 3.0
+WATCHED_S = 5.0
 QUESTION, ANSWER = "fly this? [y/N]", b"y\n"
 ASKS = 'companion ask "'
 COMMAND_S = 120.0

@@ -54,7 +54,6 @@ NOT_RUN = {
 }
 PAGES_NOT_RUN = {
     "CONTRIBUTING.md": "make runs the tests",
-    "formation.md": "a fleet and a benchmark",
     "campaigns.md": "a Ray cluster",
     "environments.md": "compiles the simulator",
     "install.md": "pip and downloads",
