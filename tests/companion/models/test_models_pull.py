@@ -216,14 +216,14 @@ def test_pull_of_a_command_downloads_once_and_uses_the_model(
     server.content = DEFAULT_EXPORT.read_bytes()
     known = replace(KNOWN[CAMERA_MODEL], size_bytes=len(server.content), sha256=file_sha256(DEFAULT_EXPORT))
     monkeypatch.setitem(KNOWN, CAMERA_MODEL, at_address(known, server.url))
-    told: list[bool] = []  # of the licence
+    noted: list[bool] = []  # of the licence
     for _ in range(2):
         result = CliRunner().invoke(app, ["detect", IMAGE, "--pull", "--json"])
         assert result.exit_code == 0, result.output
         (line,) = result.stdout.splitlines()
         assert json.loads(line)["detections"]
-        told.append("Megvii" in result.stderr)
-    assert (server.requests, told) == ([None], [True, False])
+        noted.append("Megvii" in result.stderr)
+    assert (server.requests, noted) == ([None], [True, False])
     assert [path.name for path in tmp_path.iterdir()] == [f"{CAMERA_MODEL}.onnx"]
 
 
