@@ -8,6 +8,7 @@ prints each that failed.
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,18 +17,22 @@ from contextlib import suppress
 
 from tests.companion.service_process import ServiceProcess
 
-# How a command that keeps running starts, its kind (one of a kind runs), what its command line has, and
-# what it prints when the next command can be given ("": anything).
+# How a command that keeps running starts (a pattern), its kind (one of a kind runs), what its command line
+# has, and what it prints when the next command can be given ("": anything).
 KEPT = (
     ("companion play", "service", "", "Ctrl-C ends it"),
     ("companion run", "service", "shm://", "up: autopilot"),
+    ('companion run --source "udp://', "service", "", "ready: commands on"),
+    ("companion run", "service", "udpin://", "up: autopilot"),
     ("companion run", "service", "", "ready: commands on"),
     ("companion view", "service", "", "up: camera"),
     ("ffmpeg ", "service", "| companion run", "perception running"),
     ("companion dashboard", "dashboard", "", ""),
     ("companion mcp --listen", "tools", "", "mcp: http://"),
     ("mavlink-sim --", "vehicle", "--camera", "is on"),
-    ("mavlink-sim --", "vehicle", "", ""),
+    ("mavlink-sim( --|$)", "vehicle", "", ""),
+    ("mavlink-sim camera", "camera", "", "ready: "),
+    ("tensorboard", "tensorboard", "", "TensorBoard"),
 )
 AFTER_FLIGHT = ("companion replay", "companion collect")  # the page ends the service before
 PRINTS = ("companion echo", "companion markers shm://", "companion preview shm://")  # without end
@@ -86,7 +91,7 @@ def failures(lines: Sequence[str]) -> Iterator[str]:
 
     for line in lines:
         for start, kind, part, ready in KEPT:
-            if line.startswith(start) and part in line:
+            if re.match(start, line) and part in line:
                 yield from end(kind)
                 terminal = open_terminal(line)
                 kept[kind] = line, terminal
