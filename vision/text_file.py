@@ -31,7 +31,7 @@ def read_text(path: Path) -> str:
     with open(descriptor, "rb", buffering=0) as file:
         if not stat.S_ISFIFO(os.fstat(descriptor).st_mode):
             return decode_text(file.readall())
-        # `<(…)` of a shell is a pipe with a writer; one without a writer would be waited for for ever.
+        # `<(…)` of a shell is a pipe with a writer; one without a writer would be waited for forever.
         if (first := file.read(1)) == b"":
             raise OSError(errno.EPIPE, "is a pipe that nobody writes to", str(path))
         os.set_blocking(descriptor, True)

@@ -1,4 +1,4 @@
-"""One small source of every kind, all of which show the same picture."""
+"""One small source of every kind, all of which show the same image."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Given:
     standard_input: bytes = b""
 
 
-def picture() -> NDArray[np.uint8]:
+def image() -> NDArray[np.uint8]:
     """Dark grey, with a marker at the left, the white square at the lower right, and no two equal rows."""
     image = np.full((HEIGHT, WIDTH), 40, np.uint8)
     image[:, ::8] = np.arange(HEIGHT, dtype=np.uint8)[:, None] // 8 + 20
@@ -63,7 +63,7 @@ def depth_mm() -> NDArray[np.uint16]:
 
 
 def colour() -> NDArray[np.uint8]:
-    return np.ascontiguousarray(cv2.cvtColor(picture(), cv2.COLOR_GRAY2BGR), np.uint8)
+    return np.ascontiguousarray(cv2.cvtColor(image(), cv2.COLOR_GRAY2BGR), np.uint8)
 
 
 def jpeg(image: NDArray[np.uint8] | None = None) -> bytes:
@@ -89,7 +89,7 @@ def write_video(path: Path, fourcc: str, image: NDArray[np.uint8]) -> Path:
 
 
 def lying() -> NDArray[np.uint8]:
-    """The picture as a camera stores it that was turned; rotated clockwise it is upright."""
+    """The image as a camera stores it that was turned; rotated clockwise it is upright."""
     return np.ascontiguousarray(cv2.rotate(colour(), cv2.ROTATE_90_COUNTERCLOCKWISE), np.uint8)
 
 
@@ -136,12 +136,12 @@ def rotated_video(folder: Path) -> Iterator[Given]:
 
 @contextmanager
 def grey(folder: Path) -> Iterator[Given]:
-    yield Given(write_images(folder / "grey", ".png", picture()))
+    yield Given(write_images(folder / "grey", ".png", image()))
 
 
 @contextmanager
 def sixteen_bit(folder: Path) -> Iterator[Given]:
-    yield Given(write_images(folder / "sixteen", ".png", picture().astype(np.uint16) * 257))
+    yield Given(write_images(folder / "sixteen", ".png", image().astype(np.uint16) * 257))
 
 
 @contextmanager

@@ -95,7 +95,7 @@ class Row:
     refused: tuple[str, ...] = ()
 
 
-def is_picture(image: NDArray[Any] | None, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def is_image(image: NDArray[Any] | None, size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
     """Check size, channels, contrast, and that the white square is where it was: at the lower right."""
     assert image is not None
     assert image.shape == (size[1], size[0], 3)
@@ -104,24 +104,24 @@ def is_picture(image: NDArray[Any] | None, size: tuple[int, int] = (WIDTH, HEIGH
     assert image[-side:, :side].mean() < 110
 
 
-def saved_pictures(folder: Path, count: set[int], size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+def saved_images(folder: Path, count: set[int], size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
     files = sorted(path for path in folder.iterdir() if path.is_file())
     assert len(files) in count
     for path in files:
-        is_picture(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size)
+        is_image(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size)
 
 
 def preview_saves(size: tuple[int, int]) -> Callable[[Done], None]:
     def check(done: Done) -> None:
         assert len(done.lines()) in done.frames()
-        saved_pictures(done.folder / "out", done.frames(), size)
+        saved_images(done.folder / "out", done.frames(), size)
 
     return check
 
 
 def turned_preview(done: Done) -> None:
     assert all(line.startswith("front (") and f"{HEIGHT}x{WIDTH}" in line for line in done.lines())
-    saved_pictures(done.folder / "out", done.frames(_LIMIT), (HEIGHT, WIDTH))
+    saved_images(done.folder / "out", done.frames(_LIMIT), (HEIGHT, WIDTH))
 
 
 def repeated_preview(done: Done) -> None:
@@ -131,7 +131,7 @@ def repeated_preview(done: Done) -> None:
 
 
 def depth_saves(done: Done) -> None:
-    saved_pictures(done.folder / "out", done.frames(_LIMIT))
+    saved_images(done.folder / "out", done.frames(_LIMIT))
 
 
 def depth_messages(done: Done) -> None:
@@ -145,13 +145,13 @@ def detected(done: Done) -> None:
     messages = [json.loads(line) for line in done.lines()]
     assert len(messages) in done.frames(_LIMIT)
     assert {(message["width"], message["height"]) for message in messages} == {(WIDTH, HEIGHT)}
-    saved_pictures(done.folder / "out", {len(messages)})
+    saved_images(done.folder / "out", {len(messages)})
     assert len(list((done.folder / "out" / "detections").iterdir())) == len(messages)
 
 
 def detected_every_second(done: Done) -> None:
     assert len(done.lines()) in ({FRAMES // 2} if done.given.frames else {1, 2})
-    saved_pictures(done.folder / "out", {len(done.lines())})
+    saved_images(done.folder / "out", {len(done.lines())})
 
 
 def cloud_written(done: Done) -> None:
@@ -174,7 +174,7 @@ def markers_found(done: Done) -> None:
     assert len(messages) in done.frames(_LIMIT)
     for message in messages:
         assert [marker["id"] for marker in message["markers"]] == [MARKER_ID]
-    saved_pictures(done.folder / "out", {len(messages)})
+    saved_images(done.folder / "out", {len(messages)})
 
 
 def mounted(done: Done) -> None:
@@ -433,7 +433,7 @@ def test_the_service_shows_and_records_a_kind_of_source(
     smaller = (width, round(size[1] * width / size[0]))
     for preview in messages.previews:
         if isinstance(preview, Preview):
-            is_picture(cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_UNCHANGED), smaller)
+            is_image(cv2.imdecode(np.frombuffer(preview.jpeg, np.uint8), cv2.IMREAD_UNCHANGED), smaller)
         elif isinstance(preview, DepthPreview):
             assert (preview.width, preview.height) == size
             assert len(zlib.decompress(preview.data)) == 2 * WIDTH * HEIGHT
@@ -443,7 +443,7 @@ def test_the_service_shows_and_records_a_kind_of_source(
     assert {type(preview) for preview in messages.previews} == {Preview} | of_depth
     for path, png in recorder.added:
         if not path.endswith("depth_image"):
-            is_picture(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), size)
+            is_image(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), size)
     if given.frames:  # others may be over before they are read
         counts = Counter(path for path, _ in recorder.added)
         assert {"processed", "shared"} <= counts.keys()
@@ -461,4 +461,4 @@ def _check_video(path: Path, size: tuple[int, int]) -> None:
     capture.release()
     assert images
     for image in images:
-        is_picture(image, size)
+        is_image(image, size)
