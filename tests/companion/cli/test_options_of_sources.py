@@ -371,7 +371,7 @@ class Messages:
     """The sender of a worker, and its control channel, which ends a source without an end."""
 
     def __init__(self, frames: int) -> None:
-        self.stopping = False
+        self.stopping = self.asked = False
         self.hud = Hud(("a line",), None)
         self.watched = Watched(True, depth=True, clouds=True)
         self.selections: deque[Any] = deque()
@@ -387,7 +387,7 @@ class Messages:
     def put_newest(self, message: Message) -> None:
         if isinstance(message, Report):
             self.reports.append(message)
-            self.stopping = len(self.reports) == self._frames
+            self.stopping = self.asked = len(self.reports) == self._frames
 
     def put_preview(self, preview: AnyPreview) -> None:
         self.previews.append(preview)
