@@ -440,7 +440,8 @@ def test_the_service_shows_and_records_a_kind_of_source(
         else:
             assert preview.points > 100
     of_depth = {DepthPreview, CloudPreview} if given.depth else set()
-    assert {type(preview) for preview in messages.previews} == {Preview} | of_depth
+    if given.frames or messages.previews:  # others may be over before one is due
+        assert {type(preview) for preview in messages.previews} == {Preview} | of_depth
     for path, png in recorder.added:
         if not path.endswith("depth_image"):
             is_image(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED), size)
