@@ -96,7 +96,7 @@ def test_exported_file_is_measured_on_the_runtimes_that_run_it(
         (["--model", "none.pt"], "none.pt"),
         (["--runtime", "abacus"], "runtime must be auto, torch"),
         (["--frame", "big"], "WIDTHxHEIGHT"),
-        (["--classes", "zebra"], "no class 'zebra'"),
+        (["--classes", "zebra"], "unknown class 'zebra'"),
     ],
 )
 def test_what_cannot_be_measured_is_exit_code_2(
