@@ -5,8 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import importlib.util
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -99,7 +100,7 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
                 f"the runtime {runtime} is not installed ({package} is missing): {install_command(package)}"
             )
     try:
-        return _import_openvino() if runtime == "openvino" else importlib.import_module(runtime)
+        return _IMPORTS.get(runtime, importlib.import_module)(runtime)
     except ImportError as error:
         raise RuntimeMissingError(
             f"the runtime {runtime} is installed but cannot be loaded: {error}; "
@@ -107,7 +108,17 @@ def required(runtime: RuntimeName, *, also: str | None = None) -> Any:
         ) from error
 
 
-def _import_openvino() -> Any:
+def _import_onnxruntime(name: str) -> Any:
+    """Import ONNX Runtime so that it does not report its use.
+
+    From 1.32 on it writes a device's identifier below `~/.cache` as it is imported, and reports events to
+    Microsoft over the network, unless this variable is set.
+    """
+    os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+    return importlib.import_module(name)
+
+
+def _import_openvino(name: str) -> Any:
     """Import OpenVINO so that it does not report its use.
 
     With its telemetry package it reports its import and each conversion to Intel over the network, and
@@ -116,7 +127,7 @@ def _import_openvino() -> Any:
     before = {name: sys.modules[name] for name in (_TELEMETRY,) if name in sys.modules}
     sys.modules[_TELEMETRY] = None  # type: ignore[assignment]  # It cannot be imported.
     try:
-        openvino = importlib.import_module("openvino")
+        openvino = importlib.import_module(name)
     finally:
         del sys.modules[_TELEMETRY]
         sys.modules.update(before)
@@ -126,6 +137,12 @@ def _import_openvino() -> Any:
         if getattr(telemetry, "__name__", None) == _TELEMETRY:
             module.tm = importlib.import_module("openvino.tools.ovc.telemetry_stub")  # type: ignore[attr-defined]
     return openvino
+
+
+_IMPORTS: dict[str, Callable[[str], Any]] = {
+    "onnxruntime": _import_onnxruntime,
+    "openvino": _import_openvino,
+}
 
 
 def bfloat16_instructions() -> str:

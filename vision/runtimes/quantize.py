@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from vision.evaluation.datasets import image_files, read_image
 from vision.extras import install_command
 from vision.letterbox import fit
-from vision.runtimes.base import RuntimeMissingError, RuntimeUnusableError
+from vision.runtimes.base import RuntimeMissingError, RuntimeUnusableError, required
 from vision.runtimes.exported import INPUT, ExportKind
 
 FEWEST_IMAGES = 16
@@ -70,6 +70,8 @@ def quantize_onnx(source: Path, output: Path, images: Iterable[NDArray[np.uint8]
     """
     try:
         import onnx
+
+        required("onnxruntime")  # imports it without its telemetry
         from onnxruntime import quantization
     except ImportError as error:
         raise RuntimeMissingError(

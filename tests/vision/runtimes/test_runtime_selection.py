@@ -6,6 +6,7 @@ import importlib.metadata
 import importlib.util
 import json
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -103,6 +104,36 @@ def test_openvino_does_not_report_its_use(tmp_path: Path, imported_before: bool)
     before, after = map(int, done.stdout.split())
     assert after == before
     assert (before > 0) == imported_before  # of its import, which it reports itself
+
+
+@pytest.mark.parametrize("stated", [None, "0"])
+def test_onnxruntime_is_imported_without_its_telemetry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stated: str | None
+) -> None:
+    (tmp_path / "onnxruntime.py").write_text(
+        "import os\nat_import = os.environ.get('ORT_DISABLE_TELEMETRY')\n"
+    )
+    program = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from vision.runtimes.base import required\n"
+        "print(required('onnxruntime').at_import)"
+    )
+    monkeypatch.delenv("ORT_DISABLE_TELEMETRY", raising=False)
+    if stated is not None:
+        monkeypatch.setenv("ORT_DISABLE_TELEMETRY", stated)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [stated or "1"]
+
+
+def test_onnxruntime_is_imported_in_one_place() -> None:
+    root = Path(__file__).parents[3]
+    direct = [
+        path.name
+        for package in ("vision", "companion", "mavlink_sim")
+        for path in (root / package).rglob("*.py")
+        if re.search(r"^\s*(import|from) onnxruntime", path.read_text(), re.MULTILINE)
+    ]
+    assert direct == ["quantize.py"]  # after `required`
 
 
 SETTINGS: dict[str, Any] = {"precision": "float32", "image_size": 96, "threads": 1, "confidence": 0.3}
