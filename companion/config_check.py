@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import zenoh
@@ -26,6 +27,7 @@ from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 from companion.vehicle.signing import read_key
 from vision.detector import check_detector
+from vision.extras import install_command
 from vision.sources.opening import check_address
 from vision.sources.source import SourceError, SourceUnavailableError
 
@@ -46,6 +48,7 @@ def check_settings(settings: Settings) -> list[str]:
     """
     check = _Check()
     check.plugins(settings)
+    check.extras(settings)
     check.vehicle(settings)
     check.page(settings)
     check.network(settings)
@@ -80,6 +83,17 @@ class _Check:
         """Import them: they register kinds of detectors and sources."""
         with self.fault():
             load_plugins(settings.plugins.modules)
+
+    def extras(self, settings: Settings) -> None:
+        """Check that the modules which settings need are installed. The service runs without its clients."""
+        for key, module, needed, found in (
+            ("vehicle.driver", "mavsdk", settings.vehicle.driver == "mavsdk", self.faults),
+            ("metrics.listen", "prometheus_client", settings.metrics.listen is not None, self.faults),
+            ("recording.directory", "mcap", bool(settings.recording.directory), self.missing),
+            ("foxglove.listen", "foxglove", settings.foxglove.listen is not None, self.missing),
+        ):
+            if needed and find_spec(module) is None:
+                found.append(f"{key}: {module} is not installed: {install_command(module)}")
 
     def vehicle(self, settings: Settings) -> None:
         """Check the link's address, the serial device and the signing key."""

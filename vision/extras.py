@@ -13,6 +13,7 @@ EXTRA_OF = {
     "foxglove": "foxglove",
     "gymnasium": "rl",
     "httpx": "llm",
+    "mavsdk": "mavsdk",
     "mcap": "recording",
     "mcp": "mcp",
     "mcp_types": "mcp",
