@@ -143,7 +143,7 @@ def test_invalid_plugin_options_are_one_line(tmp_path: Path) -> None:
         (("square://320x240", "--detector-kind", "blue", *PLUGINS), "'blue'; known: yolo .* red "),
         (
             ("square://320x240", "--detector-kind", "red", "--classes", "car", *PLUGINS),
-            "no class 'car'.*blob",
+            "unknown class 'car'.*blob",
         ),
         (("square://320x240", "--plugins-modules", "rad"), "no module 'rad'.* red, square"),
     ]

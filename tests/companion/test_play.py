@@ -19,6 +19,7 @@ import pytest
 import zenoh
 
 from companion.bus.client import send_command
+from companion.bus.config import EndpointTakenError
 from companion.bus.topics import DETECTIONS
 from companion.play import PlayOptions, play
 from companion.settings import Settings, ZenohSection
@@ -218,7 +219,7 @@ def test_unknown_scene_and_busy_port_are_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as busy:
         endpoint = f"tcp/127.0.0.1:{busy.getsockname()[1]}"
         settings = Settings(zenoh=ZenohSection(listen=(endpoint,)))
-        with pytest.raises(SimSessionError, match=endpoint):
+        with pytest.raises(EndpointTakenError, match=endpoint):
             play(settings, PlayOptions(), print)
     with pytest.raises(SimSessionError, match="no-such-scene"):
         play(Settings(zenoh=ZenohSection(listen=())), PlayOptions("no-such-scene"), print)
