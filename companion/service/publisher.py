@@ -58,6 +58,7 @@ class Publisher:
     ) -> None:
         self._vehicle, self._bus, self._driver = vehicle, bus, driver
         self._inputs, self._queries = inputs, queries
+        self._preview_failed = False
 
     def publish_result(
         self,
@@ -151,12 +152,16 @@ class Publisher:
     def publish_preview(self, camera: WorkerCamera, preview: AnyPreview) -> None:
         """Publish a point cloud, a depth image, or an image, which also answers the queries for one.
 
-        Never raises: perception goes on.
+        Never raises: perception goes on. A fault is logged once, until a preview is published again.
         """
         try:
             self._publish_preview(camera, preview)
         except Exception:
-            logger.exception("a preview could not be published")
+            if not self._preview_failed:
+                logger.exception("a preview could not be published (logged once, until one is)")
+            self._preview_failed = True
+        else:
+            self._preview_failed = False
 
     def _publish_preview(self, camera: WorkerCamera, preview: AnyPreview) -> None:
         if isinstance(preview, CloudPreview):

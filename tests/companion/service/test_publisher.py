@@ -1,4 +1,4 @@
-"""When the next `status` is due."""
+"""When the next `status` is due, and faults of previews."""
 
 from __future__ import annotations
 
@@ -26,3 +26,22 @@ async def test_status_follows_arming_and_mode_at_once(
     await asyncio.sleep(0)
     driver.state = replace(driver.state, **change)
     await asyncio.wait_for(due, 20.0)
+
+
+def test_fault_of_previews_is_logged_once_until_one_is_published(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    unused: Any = None
+    faults = [True, True, False, True]
+
+    def publish(*_: object) -> None:
+        if faults.pop(0):
+            raise RuntimeError("of a test")
+
+    publisher = Publisher("alpha", unused, unused, unused, unused)
+    monkeypatch.setattr(publisher, "_publish_preview", publish)
+    counts = []
+    for _ in range(4):
+        publisher.publish_preview(unused, unused)
+        counts.append(len(caplog.records))
+    assert counts == [1, 1, 1, 2]
