@@ -41,8 +41,9 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from companion.campaign import ClusterError, SeedError, map_seeds
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.from_detections import Pose
-from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.renderer import Rendered
@@ -143,11 +144,11 @@ def flight_of(seed: int, *, depth: bool, mount_sigma_rad: float = MOUNT_SIGMA_RA
 
     forward_m, right_m = rng.uniform(10.0, 15.0), rng.uniform(-8.0, 8.0)
     flight.fly(f"goto north={forward_m:.1f} east={right_m:.1f} heading=0 speed=3", 30.0, on_tick=collect)
-    fused = flight.inputs.steering.fused
+    objects = flight.inputs.steering.objects
     tracks = [
         _located(position, [(target, shown[ns]) for ns, target in of_track.items() if ns in shown], locate)
         for track_id, of_track in seen.items()
-        if (position := fused.position(track_id, 0)) is not None  # its newest
+        if (position := objects.of_track(track_id)) is not None and position.confirmed and position.located(0)
     ]
     return [track for track in tracks if track is not None]
 
@@ -165,7 +166,7 @@ def _object(name: str, number: int, rng: np.random.Generator) -> SceneObject:
     return SceneObject(name, SIZES_M[name], lambda _: ScenePose(float(north), float(east), float(yaw)))
 
 
-def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]], locate: _Locate) -> Located | None:
+def _located(fused: TrackedObject, seen: list[tuple[Target, _Shown]], locate: _Locate) -> Located | None:
     """The track against the object that most of its boxes show; None: fewer than ten show all of it."""
     truths = [_object_of(target, frame.rendered) for target, frame in seen]
     shown = [item for item in truths if item is not None]
@@ -194,9 +195,9 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]], locate: _L
     truth, relative, bound = (
         points[-1][1] if fused.moving else _fused(points) for points in (of_object, shifted, by_pose)
     )
-    position = np.array(fused.position_ned_m[:2])
+    position = np.array(fused.position_at(0)[:2])
     error = position - truth
-    major_m, minor_m, orientation = fused.ellipse
+    major_m, minor_m, orientation = fused.ellipse_at(0)
     axis = np.array((math.cos(orientation), math.sin(orientation)))
     along, across = error @ axis, error @ (-axis[1], axis[0])
     return Located(
@@ -205,7 +206,7 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]], locate: _L
         round(float(np.mean([target.ground_range_m for target, _, _ in of_object])), 2),
         round(math.hypot(*error), 3),
         round(math.hypot(*(position - relative)), 3),
-        round(range_to(item, fused.position_ned_m), 3),
+        round(range_to(item, fused.position_at(0)), 3),
         round(math.hypot(*(bound - truth)), 3),
         round(float(np.median(singles)), 3),
         fused.moving,
@@ -215,13 +216,13 @@ def _located(fused: FusedPosition, seen: list[tuple[Target, _Shown]], locate: _L
 
 def _fused(of_object: list[tuple[Target, NDArray[np.float64], _Shown]]) -> NDArray[np.float64]:
     """(2,) the true points of a track's detections, fused as the track is."""
-    tracks, position = FusedTracks(), None
+    tracks, position = ObjectTable(), None
     for target, (north, east), frame in of_object:
         exact = replace(target, position_ned_m=(float(north), float(east), 0.0), track_id=0)
         tracks.update([exact], frame.vehicle, target.captured_ns)
-        position = tracks.position(0, target.captured_ns)
+        position = tracks.of_track(0)
     assert position is not None
-    return np.array(position.position_ned_m[:2])
+    return np.array(position.position_at(0)[:2])
 
 
 def _located_by_pose(

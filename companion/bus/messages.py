@@ -30,9 +30,10 @@ from companion.bus.bodies.frames import (
 from companion.bus.bodies.vehicle import ObstaclesBody
 from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.from_detections import StateHistory, mount_at
 from companion.guidance.targets.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
-from companion.guidance.targets.fused import FusedPosition, FusedTracks
 from companion.guidance.targets.target import Target
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.state import Vector3
@@ -54,13 +55,13 @@ class Localization:
         targets: one per detection, in their order; empty if `error` gives the reason.
         error: why the detections have no direction; empty if they have.
         origin: of local NED; None while latitude and longitude are unknown.
-        fused: the positions of the confirmed tracks; None: unknown.
+        objects: the camera's; None: unknown.
     """
 
     targets: tuple[Target, ...] = ()
     error: str = ""
     origin: GeodeticOrigin | None = None
-    fused: FusedTracks | None = None
+    objects: ObjectTable | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +178,13 @@ def tracks_message(
     localization: Localization | None = None,
 ) -> TracksBody:
     """Create the message of one frame's track events; every track in it is or was confirmed."""
-    fused, origin = (None, None) if localization is None else (localization.fused, localization.origin)
+    objects, origin = (None, None) if localization is None else (localization.objects, localization.origin)
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "events": [
             _track_event(
                 event,
-                None if fused is None else fused.position(event.track.track_id, event.track.last_ns),
+                None if objects is None else objects.of_track(event.track.track_id),
                 origin,
             )
             for event in result.track_events
@@ -204,10 +205,13 @@ def _of_frame(result: PerceptionResult, vehicle: str, published_ns: int, view: s
 
 
 def _track_event(
-    event: TrackEvent, fused: FusedPosition | None, origin: GeodeticOrigin | None
+    event: TrackEvent, seen: TrackedObject | None, origin: GeodeticOrigin | None
 ) -> TrackEventBody:
     track = event.track
-    position, ellipse = (None, None) if fused is None else (fused.position_ned_m, fused.ellipse)
+    at_ns = event.track.last_ns
+    located = seen is not None and seen.confirmed and seen.located(at_ns)
+    position = seen.position_at(at_ns) if seen is not None and located else None
+    ellipse = seen.ellipse_at(at_ns) if seen is not None and located else None
     return {
         "event": event.kind.value,
         "stamp_ns": event.stamp_ns,
@@ -222,7 +226,7 @@ def _track_event(
         "first_ns": track.first_ns,
         "last_ns": track.last_ns,
         **_position_fields(position, origin, ellipse),
-        "moving": None if fused is None else fused.moving,
+        "moving": seen.moving if seen is not None and located else None,
     }
 
 

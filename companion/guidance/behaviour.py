@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.objects.in_view import ObjectsInView
 from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks, Wanted
 from companion.guidance.targets.closing_check import Approached
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
@@ -115,6 +116,7 @@ class BehaviourContext:
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
         camera_fault: why nothing that the steering camera shows is used; empty: it is.
         parameters: of the autopilot.
+        objects: what the steering camera shows and has shown, and which object a command means.
 
     >>> from companion import BehaviourContext
     >>> from companion.vehicle.state import VehicleState
@@ -144,6 +146,7 @@ class BehaviourContext:
     velocities: tuple[VelocityInput, ...] = ()
     camera_fault: str = ""
     parameters: AutopilotParameters = NOTHING_READ
+    objects: ObjectsInView = field(default_factory=ObjectsInView)
 
     def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""

@@ -32,9 +32,11 @@ from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.guidance.mode_control import ModeControl, Phase
+from companion.guidance.objects.in_view import Choice, ObjectsInView
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
-from companion.guidance.targets.chosen import RecentTracks
+from companion.guidance.targets.chosen import RecentTracks, Wanted
 from companion.guidance.targets.closing_check import ClosingCheck
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
@@ -83,6 +85,9 @@ class Guidance:
         self._setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
         self._modes = ModeControl(self._setpoints, self._out)
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
+        self._objects: tuple[TrackedObject, ...] = ()
+        self._marker_objects: tuple[TrackedObject, ...] = ()
+        self._choices: dict[Wanted, Choice] = {}
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
         # Of the steering camera, and of those that look down.
@@ -247,6 +252,7 @@ class Guidance:
         self._queue.supersede(f"an event ({standstill.why})", self._out)
         self._runner.end_after_standstill(standstill.why)
         self._tracks = RecentTracks(max_age_s=self._options.track_max_age_s)
+        self._objects = self._marker_objects = ()
         if standstill.long or standstill.suspended:
             self._standstill = standstill
             self._refuse_until_ns = now_ns + round(standstill.late_commands_s * 1e9)
@@ -301,7 +307,15 @@ class Guidance:
             camera_fault=inputs.camera_fault,
             parameters=inputs.parameters,
         )
-        return self._without_wrong_cameras(context)
+        context = self._without_wrong_cameras(context)
+        # What a camera shows that is not used is not remembered either.
+        if context.perception_fresh:
+            self._objects = inputs.objects
+        if context.steering_markers.fresh:
+            self._marker_objects = inputs.marker_objects
+        yaw_rad = 0.0 if context.state.yaw_rad is None else context.state.yaw_rad
+        in_view = ObjectsInView(self._objects, self._marker_objects, now_ns, yaw_rad, self._choices)
+        return replace(context, objects=in_view)
 
     def _without_wrong_cameras(self, context: BehaviourContext) -> BehaviourContext:
         """The context without what a camera shows that does not fit the vehicle's motion (`ClosingCheck`)."""
@@ -365,6 +379,7 @@ class Guidance:
             return
         self._closing.reset()
         self._closing_below.reset()
+        self._choices.clear()
         self._runner.begin_command(behaviour, command, context)
         if isinstance(behaviour, StopBehaviour):
             self.gimbal.end_goal(behaviour.name, self._out)

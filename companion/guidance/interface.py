@@ -9,6 +9,7 @@ from typing import Literal
 from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.search_pattern import Footprint
 from companion.guidance.targets.chosen import GimbalGoal
 from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
@@ -213,6 +214,7 @@ class GuidanceInput:
         camera_fault: why nothing that the steering camera shows is used, in words; empty: it is.
         parameters: what was read from the autopilot when the link opened or returned.
         standstill: of the computer or the process, since the previous step; None: none.
+        objects: of the steering camera, as of its newest frame. marker_objects: its markers in the same form.
     """
 
     state: VehicleState
@@ -235,6 +237,8 @@ class GuidanceInput:
     parameters: AutopilotParameters = NOTHING_READ
     standstill: Standstill | None = None
     camera_fault: str = ""
+    objects: tuple[TrackedObject, ...] = ()
+    marker_objects: tuple[TrackedObject, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,12 +15,12 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from companion.guidance.objects.table import ObjectTable
 from companion.guidance.targets.from_detections import (
     HistoryError,
     StateHistory,
     targets_from_detections,
 )
-from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.targets.target import Target
 from companion.load import with_load
@@ -68,7 +68,7 @@ class PerceptionCamera:
         obstacles: of the newest new depth image; None before the first.
         targets: that result's localized objects, after `localize`.
         localization_error: why they could not be localized; empty if they were.
-        fused: the positions of its confirmed tracks, after `localize`.
+        objects: what it shows and has shown, after `localize`.
         class_names: classes of the detector; None before it is loaded.
         planned: the newest planned path; None before the first.
         path_request: what path to plan, the newest request.
@@ -85,7 +85,7 @@ class PerceptionCamera:
         self.obstacles: ObstacleSectors | None = None
         self.targets: tuple[Target, ...] = ()
         self.localization_error = ""
-        self.fused = FusedTracks()
+        self.objects = ObjectTable()
         self.planned: PlannedPath | None = None
         self.path_request: PathRequest | None = None
         self._class_names = class_names
@@ -143,7 +143,7 @@ class PerceptionCamera:
         """What was received is outdated, and so is a result of an image from before, when it arrives."""
         self._valid_from_ns = now_ns
         self.newest = self.planned = self.seen_ns = self.obstacles = None
-        self.targets, self.fused = (), FusedTracks()
+        self.targets, self.objects = (), ObjectTable()
 
     def localize(self, result: PerceptionResult, history: StateHistory) -> None:
         """Set `targets` from a result, or `localization_error`."""
@@ -157,9 +157,8 @@ class PerceptionCamera:
                 self.settings.detector.heights(),
             )
             self.localization_error = ""
-            if self.targets:
-                vehicle = history.at(result.captured_ns).position_ned_m
-                self.fused.update(self.targets, vehicle, result.captured_ns)
+            vehicle = history.at(result.captured_ns).position_ned_m
+            self.objects.update(self.targets, vehicle, result.captured_ns)
         except HistoryError as error:
             # Without an attitude at the capture a box has no direction: it is published, but not a target.
             self.targets, self.localization_error = (), str(error)

@@ -8,6 +8,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
 from companion.guidance.targets.from_map import (
     TURNED_RAD,
@@ -64,6 +66,7 @@ class MarkerTracker:
         }
         self._resolvers = {camera.name: AmbiguityResolver() for camera in self._detecting}
         self._seen: dict[str | None, _SeenMarkers] = {}
+        self._objects = {camera.name: ObjectTable() for camera in self._detecting}
         # Camera → id → frames in a row with the marker, and the newest.
         self._runs: dict[str | None, dict[int, tuple[int, MarkerTarget]]] = {}
         self._maps = {
@@ -120,6 +123,10 @@ class MarkerTracker:
         times = Counter(target.identifier for target in targets)
         once = tuple(target for target in targets if times[target.identifier] == 1)
         self._seen[camera.name] = _SeenMarkers(result.captured_ns, once, down)
+        if not error_text:
+            vehicle = history.at(result.captured_ns).position_ned_m
+            seen = [target.as_target() for target in once]
+            self._objects[camera.name].update(seen, vehicle, result.captured_ns)
         return LocalizedMarkers(targets, boards, error_text, vision)
 
     def _vision(
@@ -224,7 +231,13 @@ class MarkerTracker:
     def discard_received(self) -> None:
         """What was received is outdated."""
         self._seen.clear()
+        self._objects = {camera.name: ObjectTable() for camera in self._detecting}
         self._runs.clear()
+
+    def objects(self, camera: PerceptionCamera) -> tuple[TrackedObject, ...]:
+        """A camera's markers as objects, as of its newest frame."""
+        table = self._objects.get(camera.name)
+        return () if table is None else table.objects
 
     def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the steering camera, for behaviours that fly to one."""

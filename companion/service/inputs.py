@@ -134,6 +134,8 @@ class InputAssembler:
             self.parameters,
             standstill,
             steering.frozen(now_ns),
+            steering.objects.objects,
+            self._markers.objects(steering),
         )
 
     def discard_received(self, now_ns: int) -> None:

@@ -241,7 +241,7 @@ class Service:
             if camera.repeats:  # the targets are those of an earlier result
                 localization = Localization(error="no new image")
             else:
-                localization = Localization(camera.targets, camera.localization_error, fused=camera.fused)
+                localization = Localization(camera.targets, camera.localization_error, objects=camera.objects)
             if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:

@@ -27,11 +27,10 @@ from companion.guidance.motion import (
     stopping_point,
     stopping_speed,
 )
-from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.target import RangeSource, Target
-from companion.guidance.targets.track import ObjectTrack
+from companion.guidance.targets.target import RangeSource
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -44,21 +43,11 @@ STANDING_MPS = 0.3
 # The end of the approach is flown to a fixed point before the object, so that wind does not carry the vehicle
 # around it. Within the first distance of that point it is fixed; beyond the second it is released.
 ANCHOR_M = (1.5, 3.0)
-# That point follows the object's filtered position with this time constant: the filter follows the noise of
-# single ranges, which is greater without depth and changes with the vehicle's roll. An object whose filtered
-# position is farther off than STILL_M, or than this fraction of its range, has moved and is not reached yet.
-GOAL_TIME_CONSTANT_S = 1.5
-GOAL_TIME_CONSTANT_WITHOUT_DEPTH_S = 3.0
-STILL_M = 0.6
-STILL_FRACTION = 0.1
-MAX_LAG_M = 0.25
 # Arrival tolerance with depth. Smaller than that of other arrivals, because errors of range and own estimate
 # add to it, and the hold that follows keeps the error. Without depth the goal itself drifts by more.
 REACHED_M = 0.15
 # Detectors miss single frames; after this long without the object the vehicle brakes.
 LOST_AFTER_S = 1.0
-# A detection within this angle of a lost object, at 0.5 to 2 times its range, is associated with it.
-SAME_BEARING_RAD = math.radians(6.0)
 # Nearer than this the bearing to the object's nearest point is too noisy to follow.
 MIN_YAW_RANGE_M = 1.0
 BASE_TIMEOUT_S = 45.0
@@ -103,8 +92,7 @@ class ApproachBehaviour(Behaviour):
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._confidence = confidence
         self._lost_timeout_s = lost_timeout_s
-        self._track: ObjectTrack | None = None
-        self._selector = TargetSelector()
+        self._object: TrackedObject | None = None
         self._doubted = False
         self._down_m = 0.0
         self._seen_ns = 0
@@ -113,18 +101,16 @@ class ApproachBehaviour(Behaviour):
         self._bearing_rad: float | None = None
         self._wait_point: Vector3 | None = None
         self._anchor_rad: float | None = None
-        self._object_ned_m: Vector3 = (0.0, 0.0, 0.0)
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
-        self._last_id: int | None = None
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
         self._down_m = position[2]
         self._started_ns = self._seen_ns = context.now_ns
         self._until_ns = context.now_ns + BASE_TIMEOUT_S * 1e9
-        self._track = self._bearing_rad = self._wait_point = self._anchor_rad = None
-        self._selector = TargetSelector()
+        self._object = self._bearing_rad = self._wait_point = self._anchor_rad = None
+        context.objects.forget(self._subject)
         self._doubted = False
         self.lost_at = None
         self._arrival, self._controller = Arrival(), PositionController()
@@ -135,14 +121,15 @@ class ApproachBehaviour(Behaviour):
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns, state = context.now_ns, context.state
         position, yaw_rad = position_and_yaw(state)
-        self._observe(context, position, yaw_rad)
-        track = self._track
+        self._observe(context)
+        track = self._object
         unseen_s = (now_ns - self._seen_ns) / 1e9
         if track is not None:
-            north, east, _ = track.position_ned_m
+            point = track.position_at(now_ns)
+            north, east, _ = point
             self._range_m = math.hypot(north - position[0], east - position[1])
         if self._tracking is not None:
-            newest = None if track is None else track.newest
+            newest = None if track is None else track.detection
             why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"approach lost the gimbal: {why}")
@@ -162,12 +149,9 @@ class ApproachBehaviour(Behaviour):
             self._bearing_rad = bearing
         error_m = self._range_m - self._distance_m
         top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
-        goal = self._goal(track.position_ned_m, position, bearing, dt_s)
+        goal = self._goal(point, position, bearing)
         if goal is not None:
-            self._range_m = math.dist(self._object_ned_m[:2], position[:2])
-            moved_m = math.dist(self._object_ned_m[:2], track.position_ned_m[:2])
-            still = moved_m < max(STILL_M, STILL_FRACTION * self._range_m)
-            off_m = math.dist(goal, position) if still else math.inf
+            off_m = math.inf if track.moving else math.dist(goal, position)
             near_m = REACHED_M if self._by_depth else ARRIVED_M
             if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
                 return Outcome(True, f"reached {self._subject.name} at {self._range_m:.1f} m", goal)
@@ -187,7 +171,7 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def approached(self) -> Approached | None:
-        return None if self._track is None else Approached(self._track.newest)
+        return None if self._object is None else Approached(self._object.detection)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
@@ -195,83 +179,42 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
-        if self._track is None:
+        if self._object is None:
             return f"looking for {self._subject.phrase}"
         if self._wait_point is not None:
-            return f"lost {self._subject.phrase_now(self._last_id)}, waiting"
-        return f"{self._subject.phrase_now(self._last_id)} {self._range_m:.1f} m away"
+            return f"lost {self._subject.phrase_now(self._object.track_id)}, waiting"
+        return f"{self._subject.phrase_now(self._object.track_id)} {self._range_m:.1f} m away"
 
-    def _observe(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> None:
-        if (track := self._track) is not None:
-            if track.update(
-                self._subject.same(context.targets_of(self._subject), track.newest, self._confidence),
-                position,
-            ):
-                self._seen_ns = track.captured_ns
-            elif context.now_ns - self._seen_ns > LOST_AFTER_S * 1e9:
-                fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
-                self._track = track = self._found_again(track, fitting, position)
-            self.add_notes(*self._subject.new_id(self._last_id, track.track_id))
-            self._last_id = track.track_id
+    def _observe(self, context: BehaviourContext) -> None:
+        seen = context.objects.of(self._subject, self._confidence)
+        if seen is None:
+            fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
+            if fitting:
+                self._doubted = not any(target.trusted for target in fitting)
             return
-        fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
-        if fitting:
-            self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
-        if chosen is None:
-            return
-        if chosen.position_ned_m is None:
+        if seen.position_ned_m is None:
             # Fully inside the image it may get a range.
-            self._bearing_rad = chosen.bearing_rad
+            self._bearing_rad = seen.detection.bearing_rad
             if self._tracking is not None:
-                self._tracking.turn_to(chosen, context)
+                self._tracking.turn_to(seen.detection, context)
             return
-        self._begin(chosen, position, context.now_ns)
+        before, self._object, self._seen_ns = self._object, seen, seen.last_ns
+        if before is None:
+            path_m = abs(seen.detection.ground_range_m - self._distance_m)
+            self._until_ns = context.now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9
+        else:
+            self.add_notes(*self._subject.new_id(before.track_id, seen.track_id))
 
-    def _found_again(self, lost: ObjectTrack, fitting: list[Target], position: Vector3) -> ObjectTrack:
-        """Restart the track at a detection near the lost object: a wrong range can divert a track."""
-        north, east = lost.position_ned_m[0] - position[0], lost.position_ned_m[1] - position[1]
-        bearing, range_m = math.atan2(east, north), math.hypot(north, east)
-        for target in sorted(fitting, key=lambda target: target.track_id != lost.track_id):
-            if target.captured_ns <= self._seen_ns or target.position_ned_m is None:
-                continue
-            if not target.trusted or lost.is_another(target):
-                continue
-            off = abs(wrap_angle(target.bearing_rad - bearing))
-            if off < SAME_BEARING_RAD and 0.5 * range_m < target.ground_range_m < 2.0 * range_m:
-                self._seen_ns = target.captured_ns
-                return lost.restart(target, position)
-        return lost
-
-    def _begin(self, target: Target, position: Vector3, now_ns: int) -> None:
-        self._track, self._last_id = ObjectTrack(target, position), target.track_id
-        self._seen_ns = target.captured_ns
-        path_m = abs(target.ground_range_m - self._distance_m)
-        self._until_ns = now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9
-
-    def _goal(self, point: Vector3, position: Vector3, bearing: float, dt_s: float) -> Vector3 | None:
+    def _goal(self, point: Vector3, position: Vector3, bearing: float) -> Vector3 | None:
         """The point to stop at, once it is near: on the vehicle's side of the object."""
         chosen = self._anchor_rad is not None
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
-        if chosen:
-            time_constant_s = GOAL_TIME_CONSTANT_S if self._by_depth else GOAL_TIME_CONSTANT_WITHOUT_DEPTH_S
-            gain = min(1.0, dt_s / time_constant_s)
-            was, now, down = self._object_ned_m, point, point[2]
-            point = (was[0] + gain * (now[0] - was[0]), was[1] + gain * (now[1] - was[1]), down)
-            # The lag of the smoothed position behind an approaching object is limited.
-            nearer_m = (now[0] - point[0]) * math.cos(away_rad) + (now[1] - point[1]) * math.sin(away_rad)
-            if nearer_m > MAX_LAG_M:
-                north, east = math.cos(away_rad), math.sin(away_rad)
-                excess_m = nearer_m - MAX_LAG_M
-                point = (point[0] + excess_m * north, point[1] + excess_m * east, down)
         goal = (
             point[0] + self._distance_m * math.cos(away_rad),
             point[1] + self._distance_m * math.sin(away_rad),
             self._down_m,
         )
-        self._object_ned_m = point
-        near = math.dist(goal[:2], position[:2]) < ANCHOR_M[1 if chosen else 0]
-        if not near:
+        if math.dist(goal[:2], position[:2]) >= ANCHOR_M[1 if chosen else 0]:
             self._leave_goal()
             return None
         self._anchor_rad = away_rad
@@ -279,10 +222,8 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def _by_depth(self) -> bool:
-        return self._track is not None and self._track.newest.range_source in (
-            RangeSource.DEPTH,
-            RangeSource.MARKER,
-        )
+        by_depth = (RangeSource.DEPTH, RangeSource.MARKER)
+        return self._object is not None and self._object.range_source in by_depth
 
     def _leave_goal(self) -> None:
         self._anchor_rad = None
@@ -299,12 +240,12 @@ class ApproachBehaviour(Behaviour):
                 why = context.perception_fault("no detections received")
             elif self._doubted:
                 why = self._subject.doubted
-            elif self._track is None:
+            elif self._object is None:
                 why = "never seen with a known range"
             else:
                 why = f"last seen {self._range_m:.1f} m away"
-                self.lost_at = self._track.position_ned_m
-                why += context.tracks.replacement(self._track.newest, context.now_ns)
+                self.lost_at = self._object.position_at(context.now_ns)
+                why += context.tracks.replacement(self._object.detection, context.now_ns)
             return Outcome(False, f"lost {self._subject.phrase} for {unseen_s:.1f} s: {why}")
         if self._wait_point is None and ground_speed(context.state) < STANDING_MPS:
             north, east, _ = stopping_point(context.state)

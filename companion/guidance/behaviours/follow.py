@@ -25,9 +25,8 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
-from companion.guidance.targets.choosing import TargetSelector
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.moving_track import MovingTrack
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
@@ -159,8 +158,7 @@ class FollowBehaviour(Behaviour):
         self._forget(0, 0.0)
 
     def _forget(self, now_ns: int, down_m: float) -> None:
-        self._track: MovingTrack | None = None
-        self._selector = TargetSelector()
+        self._object: TrackedObject | None = None
         self._started_ns = self._seen_ns = now_ns
         self._down_m = down_m
         self._doubted = False
@@ -172,14 +170,15 @@ class FollowBehaviour(Behaviour):
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
         self._forget(context.now_ns, position[2])
+        context.objects.forget(self._subject)
         if self._tracking is not None:
             self._tracking.begin(context)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns, state = context.now_ns, context.state
-        position, yaw_rad = position_and_yaw(state)
-        self._observe(context, yaw_rad)
-        track = self._track
+        position, _ = position_and_yaw(state)
+        self._observe(context)
+        track = self._object
         self._unseen_s = (now_ns - self._seen_ns) / 1e9
         if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
             if track is None:
@@ -194,7 +193,7 @@ class FollowBehaviour(Behaviour):
             north, east = point[0] - position[0], point[1] - position[1]
             self._range_m = math.hypot(north, east)
         if self._tracking is not None:
-            newest = None if track is None else track.newest
+            newest = None if track is None else track.detection
             why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"follow lost the gimbal: {why}")
@@ -209,7 +208,7 @@ class FollowBehaviour(Behaviour):
         north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps, VELOCITY_ERROR_GAIN)
         return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
 
-    def _wanted(self, track: MovingTrack, towards_rad: float, dt_s: float) -> tuple[float, float]:
+    def _wanted(self, track: TrackedObject, towards_rad: float, dt_s: float) -> tuple[float, float]:
         """Horizontal velocity: the object's own, plus corrections along and across the line to it.
 
         In polar coordinates about the object, so that the path to another side of it leads around it.
@@ -218,7 +217,7 @@ class FollowBehaviour(Behaviour):
         if self._unseen_s > UNSEEN_S:
             # The longer the prediction, the less it is followed.
             trust *= max(0.0, 1.0 - (self._unseen_s - UNSEEN_S) / max(self._occlusion_s, UNSEEN_S)) ** 0.5
-        north, east = (trust * speed for speed in track.velocity)
+        north, east = (trust * speed for speed in track.velocity_ned_mps)
         closing = GAIN_PER_S * (self._range_m - self._distance_m)
         closing = max(-MOST_CLOSING_MPS, min(MOST_CLOSING_MPS, closing))
         circling = 0.0
@@ -231,13 +230,13 @@ class FollowBehaviour(Behaviour):
         c, s = math.cos(towards_rad), math.sin(towards_rad)
         return (north + closing * c + circling * s, east + closing * s - circling * c)
 
-    def _goal_rad(self, track: MovingTrack, dt_s: float) -> float | None:
+    def _goal_rad(self, track: TrackedObject, dt_s: float) -> float | None:
         """Goal bearing, seen from the object; None: anywhere on the circle."""
         if self._bearing == "here":
             return None
         if self._bearing == "compass":
             return wrap_angle(self._angle_rad)
-        north, east = track.velocity
+        north, east = track.velocity_ned_mps
         if math.hypot(north, east) > COURSE_MPS:
             course = math.atan2(east, north)
             if self._course_rad is None:
@@ -247,44 +246,34 @@ class FollowBehaviour(Behaviour):
             self._course_rad = wrap_angle(self._course_rad + max(-most, min(most, turn)))
         return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
 
-    def _observe(self, context: BehaviourContext, yaw_rad: float) -> None:
-        if not context.fresh(self._subject):
+    def _observe(self, context: BehaviourContext) -> None:
+        seen = context.objects.of(self._subject, self._confidence)
+        if seen is None:
+            fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
+            if fitting:
+                self._doubted = not any(target.trusted for target in fitting)
             return
-        position, _ = position_and_yaw(context.state)
-        if (track := self._track) is not None:
-            before = track.track_id
-            if track.update(
-                self._subject.same(context.targets_of(self._subject), track.newest, self._confidence),
-                position,
-            ):
-                self._seen_ns = track.captured_ns
-                self.add_notes(*self._subject.new_id(before, track.track_id))
-            return
-        fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
-        if fitting:
-            self._doubted = not any(target.trusted for target in fitting)
-        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
-        if chosen is None:
-            return
-        if chosen.position_ned_m is None:
+        if seen.position_ned_m is None:
             # Fully inside the image it may get a range.
-            self._yaw_rad = chosen.bearing_rad
+            self._yaw_rad = seen.detection.bearing_rad
             if self._tracking is not None:
-                self._tracking.turn_to(chosen, context)
+                self._tracking.turn_to(seen.detection, context)
             return
-        self._track, self._seen_ns = MovingTrack(chosen, position), chosen.captured_ns
+        before, self._object, self._seen_ns = self._object, seen, seen.last_ns
+        if before is not None:
+            self.add_notes(*self._subject.new_id(before.track_id, seen.track_id))
 
     def _lost(self, context: BehaviourContext) -> str:
         if not context.fresh(self._subject):
             why = context.perception_fault("no detections received")
-        elif self._track is not None:
-            north, east = self._track.velocity
+        elif self._object is not None:
+            north, east = self._object.velocity_ned_mps
             moving = (
                 f", moving at {math.hypot(north, east):.1f} m/s to {in_degrees(math.atan2(east, north))}°"
             )
             why = f"last expected {self._range_m:.1f} m away{moving}"
-            expected = self._track.position_at(context.now_ns)
-            why += context.tracks.replacement(self._track.newest, context.now_ns, expected)
+            expected = self._object.position_at(context.now_ns)[:2]
+            why += context.tracks.replacement(self._object.detection, context.now_ns, expected)
         elif self._doubted:
             why = self._subject.doubted
         else:
@@ -297,9 +286,9 @@ class FollowBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
-        if self._track is None:
+        if self._object is None:
             return f"looking for {self._subject.phrase}"
         hidden = f", unseen for {self._unseen_s:.1f} s" if self._unseen_s > UNSEEN_S else ""
         return (
-            f"following {self._subject.phrase_now(self._track.track_id)}, {self._range_m:.1f} m away{hidden}"
+            f"following {self._subject.phrase_now(self._object.track_id)}, {self._range_m:.1f} m away{hidden}"
         )

@@ -34,8 +34,8 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -70,6 +70,8 @@ TURNING_FRACTION = 0.8
 PACE_GAIN, MAX_PACE_MPS2, PACE_FILTER_S = 1.0, 0.5, 0.5
 SLOWEST_MPS = 0.5
 
+# Within this time an object must be chosen. Unseen for longer than that, a moving one is lost.
+LOOK_S, LOST_AFTER_S = 2.0, 3.0
 # Limit of the centripetal acceleration of a command.
 MAX_CENTRIPETAL_MPS2 = 2.0
 
@@ -128,8 +130,9 @@ class OrbitBehaviour(Behaviour):
     and heading compensate any delays of the vehicle. It flies slower where the envelope would not let it keep
     the radius.
 
-    The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, the position
-    of the object of that class nearest to the nose or, with a track or a marker, of that; determined once.
+    The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, a track or a
+    marker, where the object is: the circle moves with it, on top of `speed_mps`. A moving object that is lost
+    ends the orbit; one that stands is circled unseen.
     """
 
     name = "orbit"
@@ -155,13 +158,16 @@ class OrbitBehaviour(Behaviour):
         self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
         self._turn = 1.0 if clockwise else -1.0
         self._centre: Vector3 | None = None
+        self._object: TrackedObject | None = None
+        self._drift_mps = (0.0, 0.0)
+        self._begun_ns = 0
         self._down_m = 0.0
         self._angle_rad: float | None = None
         self._flown_rad = 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
         self._bias = VelocityBias()
-        self._until_ns: float = 0
+        self._until_ns: float = math.inf
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, yaw_rad = position_and_yaw(context.state)
@@ -170,7 +176,7 @@ class OrbitBehaviour(Behaviour):
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
         self._bias = VelocityBias()
-        self._centre = None
+        self._centre, self._drift_mps = None, (0.0, 0.0)
         if self._subject is None:
             self._centre = (
                 position[0] + self._radius_m * math.cos(yaw_rad),
@@ -178,18 +184,47 @@ class OrbitBehaviour(Behaviour):
                 position[2],
             )
         else:
-            self._centre = _position_of(self._subject, context, yaw_rad)
-        away_m = 0.0 if self._centre is None else math.dist(position[:2], self._centre[:2])
-        path_m = self._laps * math.tau * self._radius_m + abs(away_m - self._radius_m)
+            context.objects.forget(self._subject)
+        self._object, self._begun_ns, self._until_ns = None, context.now_ns, math.inf
+
+    def _begin_circle(self, centre: Vector3, position: Vector3, context: BehaviourContext) -> None:
+        path_m = self._laps * math.tau * self._radius_m
+        path_m += abs(math.dist(position[:2], centre[:2]) - self._radius_m)
         turning_mps2 = TURNING_FRACTION * context.max_acceleration_mps2
         slow_mps = min(self._speed_mps, math.sqrt(turning_mps2 * self._radius_m))
         self._until_ns = context.now_ns + (2.0 * path_m / slow_mps + 30.0) * 1e9
 
+    def _observe(self, context: BehaviourContext) -> str | None:
+        """Move the centre with the object. Returns why that is not possible, in words; None: it is."""
+        subject, now_ns = self._subject, context.now_ns
+        if subject is None:
+            return None
+        seen = context.objects.of(subject)
+        if seen is None or seen.position_ned_m is None:
+            if context.objects.shows(subject) and now_ns - self._begun_ns <= LOOK_S * 1e9:
+                return None
+            return f"no localized {subject.name!r} to orbit"
+        before, self._object = self._object, seen
+        if before is not None:
+            self.add_notes(*subject.new_id(before.track_id, seen.track_id))
+        unseen_s = seen.unseen_s(now_ns)
+        if seen.moving and unseen_s > LOST_AFTER_S:
+            speed_mps = math.hypot(*seen.velocity_ned_mps)
+            return f"lost {subject.phrase} for {unseen_s:.1f} s: it moved at {speed_mps:.1f} m/s"
+        self._centre = seen.position_at(now_ns)
+        self._drift_mps = seen.velocity_ned_mps if seen.moving else (0.0, 0.0)
+        return None
+
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        if self._centre is None:
-            assert self._subject is not None
-            return Outcome(False, f"no localized {self._subject.name!r} to orbit")
         position, yaw_rad = position_and_yaw(context.state)
+        if (why := self._observe(context)) is not None:
+            return Outcome(False, why)
+        if self._centre is None:
+            return Setpoint.velocity(
+                (0.0, 0.0, correction(self._down_m - position[2])), context.now_ns, yaw_rate_radps=0.0
+            )
+        if self._until_ns == math.inf:
+            self._begin_circle(self._centre, position, context)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]
         distance = math.hypot(north, east)
         angle = math.atan2(east, north)
@@ -209,8 +244,10 @@ class OrbitBehaviour(Behaviour):
                 (self._speed_mps, 0.0, correction(self._down_m - position[2])), context.now_ns
             )
         outward = (north / distance, east / distance)
+        # All of this is relative to the centre, which may move.
         measured = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
-        north_mps, east_mps = measured[0] + bias[0], measured[1] + bias[1]
+        drift = self._drift_mps
+        north_mps, east_mps = measured[0] + bias[0] - drift[0], measured[1] + bias[1] - drift[1]
         out_mps = outward[0] * north_mps + outward[1] * east_mps
         along_mps = self._turn * (outward[0] * east_mps - outward[1] * north_mps)
         self._adapt_pace(along_mps, distance, context.max_acceleration_mps2, dt_s)
@@ -218,8 +255,8 @@ class OrbitBehaviour(Behaviour):
         self._asked_mps = (asked_out_mps, asked_along_mps)
         around_mps = self._turn * asked_along_mps
         velocity = (
-            outward[0] * asked_out_mps - outward[1] * around_mps - bias[0],
-            outward[1] * asked_out_mps + outward[0] * around_mps - bias[1],
+            outward[0] * asked_out_mps - outward[1] * around_mps - bias[0] + drift[0],
+            outward[1] * asked_out_mps + outward[0] * around_mps - bias[1] + drift[1],
             correction(self._down_m - position[2]),
         )
         bearing = math.atan2(-east, -north)
@@ -272,15 +309,3 @@ class OrbitBehaviour(Behaviour):
     def status(self) -> str:
         angle = 0.0 if self._angle_rad is None else self._angle_rad
         return f"orbiting, {self._flown_rad / math.tau:.1f} laps, {in_degrees(angle)}° from the centre"
-
-
-def _position_of(wanted: Wanted, context: BehaviourContext, yaw_rad: float) -> Vector3 | None:
-    """Of the object nearest to the nose; of a track that is missed in this frame, the newest position."""
-    seen: list[Target] = wanted.of(
-        context.targets_of(wanted) if wanted.track_id is None else context.tracks.targets
-    )
-    if wanted.marker_id is not None:
-        seen = [target for target in seen if target.trusted]
-    located = [target for target in seen if target.position_ned_m is not None]
-    nearest = min(located, key=lambda t: abs(wrap_angle(t.bearing_rad - yaw_rad)), default=None)
-    return None if nearest is None else nearest.position_ned_m

@@ -26,11 +26,10 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.motion import Arrival, position_and_yaw, speed_of
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
-from companion.guidance.targets.choosing import TargetSelector
 from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
@@ -133,29 +132,30 @@ class PolicyBehaviour(Behaviour):
             raise PolicyError(
                 f"{policy.name} was trained for a distance of {trained.allowed}, not {distance_m:g} m"
             )
-        self._selector, self._arrival = TargetSelector(), Arrival()
-        self._track: ObjectTrack | None = None
+        self._arrival = Arrival()
+        self._object: TrackedObject | None = None
         self._hold: HoldBehaviour | None = None
         self._action = dict.fromkeys(ACTIONS, 0.0)
         self._begun_ns = self._due_ns = 0
         self._range_m = math.nan
 
     def on_activate(self, context: BehaviourContext) -> None:
-        self._selector, self._arrival = TargetSelector(), Arrival()
-        self._track = self._hold = None
+        self._arrival = Arrival()
+        self._object = self._hold = None
+        context.objects.forget(self._wanted)
         self._begun_ns = self._due_ns = context.now_ns
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         position, yaw_rad = position_and_yaw(context.state)
         elapsed_s = (context.now_ns - self._begun_ns) / 1e9
-        track = self._observed(context, position, yaw_rad)
-        if track is None:
+        seen = self._observed(context)
+        if seen is None:
             if elapsed_s > LOOK_S:
                 why = "range never known" if context.perception_fresh else "no detections received"
                 why = context.perception_fault(why)
                 return Outcome(False, f"no {self._wanted.name} to fly to in {elapsed_s:.0f} s: {why}")
             return self._wait(dt_s, context)
-        values = self._observation(track, context, position, yaw_rad)
+        values = self._observation(seen, context, position, yaw_rad)
         self._range_m = math.hypot(values["target_forward_m"], values["target_right_m"])
         at_m = abs(self._range_m - self._distance_m)
         lost = values["target_age_s"] > LOST_AFTER_S
@@ -186,26 +186,22 @@ class PolicyBehaviour(Behaviour):
             self._hold.on_activate(context)
         return self._hold.update(dt_s, context)
 
-    def _observed(self, context: BehaviourContext, position: Vector3, yaw_rad: float) -> ObjectTrack | None:
-        """The object with its newest detection; None: none with a known range yet."""
-        if self._track is not None:
-            same = self._wanted.same(context.targets, self._track.newest, CONFIDENCE)
-            self._track.update(same, position)
-            return self._track
-        fitting = self._wanted.of(context.targets, CONFIDENCE)
-        chosen = self._selector.update(fitting, yaw_rad, context.now_ns)
-        if chosen is not None and chosen.position_ned_m is not None:
-            self._track = ObjectTrack(chosen, position)
-        return self._track
+    def _observed(self, context: BehaviourContext) -> TrackedObject | None:
+        """The object; None: none with a known range yet."""
+        seen = context.objects.of(self._wanted, CONFIDENCE)
+        if seen is not None and seen.position_ned_m is not None:
+            self._object = seen
+        return self._object
 
     def _observation(
-        self, track: ObjectTrack, context: BehaviourContext, position: Vector3, yaw_rad: float
+        self, seen: TrackedObject, context: BehaviourContext, position: Vector3, yaw_rad: float
     ) -> dict[str, float]:
-        north, east, down = (there - here for there, here in zip(track.position_ned_m, position, strict=True))
+        there_ned_m = seen.position_at(context.now_ns)
+        north, east, down = (there - here for there, here in zip(there_ned_m, position, strict=True))
         target_forward, target_right = _rotated(north, east, -yaw_rad)
         north_mps, east_mps, down_mps = context.state.velocity_ned_mps or (math.nan,) * 3
         forward_mps, right_mps = _rotated(north_mps, east_mps, -yaw_rad)
-        age_s = (context.now_ns - track.captured_ns) / 1e9
+        age_s = seen.unseen_s(context.now_ns)
         values = (target_forward, target_right, -down, forward_mps, right_mps, -down_mps, age_s)
         return dict(zip(OBSERVATIONS, (*values, self._distance_m), strict=True))
 
@@ -230,11 +226,11 @@ class PolicyBehaviour(Behaviour):
 
     @property
     def approached(self) -> Approached | None:
-        return None if self._track is None else Approached(self._track.newest)
+        return None if self._object is None else Approached(self._object.detection)
 
     @property
     def status(self) -> str:
-        if self._track is None:
+        if self._object is None:
             return f"policy {self._policy.name}, looking for {self._wanted.phrase}"
         if self._hold is not None:
             return f"policy {self._policy.name}, lost {self._wanted.phrase}, waiting"

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.targets.from_markers import marker_name
 from companion.guidance.targets.target import DOUBTED, UNCONFIRMED_MARKER, Target
 from companion.vehicle.gimbal import GimbalAim
@@ -62,6 +63,12 @@ class Wanted:
         if self.track_id is None or track_id in (None, self.track_id):
             return self.phrase
         return f"track {track_id} (was {self.track_id})"
+
+    def means(self, seen: TrackedObject) -> bool:
+        """Whether an object is one of these."""
+        if self.track_id is not None:
+            return seen.track_id == self.track_id
+        return seen.class_name == (self.class_name or self.name)
 
     def of(self, targets: Collection[Target], confidence: float = 0.0) -> list[Target]:
         """These objects' targets with at least a confidence; of `BehaviourContext.targets_of`."""

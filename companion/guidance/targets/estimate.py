@@ -26,9 +26,12 @@ ACCELERATION_M2_PER_S3 = 1.5
 # One sigma of the unknown initial velocity.
 FIRST_VELOCITY_SIGMA_MPS = 2.0
 FASTEST_MPS = 15.0
-# Range errors from attitude, height and slope are correlated between frames: relative to the last frame the
-# noise of a moving object is this fraction of a sigma, unless the range source has changed.
+# Range errors from attitude, height and slope are correlated between frames, those of depth are not: relative
+# to the last frame the noise of a moving object is this fraction of a sigma, unless the source has changed.
+_CORRELATED = frozenset({RangeSource.GROUND_PLANE, RangeSource.KNOWN_HEIGHT, RangeSource.MARKER})
 FRAME_TO_FRAME = 0.35
+# That of depth is not less than this along the line of sight: the nearest point of a surface jumps.
+JITTER_M = 0.2
 # Noise of one measurement across the line of sight, one sigma: a few pixels and a degree of attitude.
 BEARING_SIGMA_RAD = 0.03
 ACROSS_SIGMA_M = 0.25
@@ -100,15 +103,9 @@ class Estimate:
         elapsed_s = max(0.0, (stamp_ns - self.captured_ns) / 1e9)
         move = np.eye(4)
         move[0, 2] = move[1, 3] = elapsed_s
-        q = ACCELERATION_M2_PER_S3
-        noise = np.zeros((4, 4))
-        for axis in (0, 1):
-            if not self.moving:
-                noise[axis, axis] = RANDOM_WALK_M2_PER_S * elapsed_s
-                continue
-            noise[axis, axis] = q * elapsed_s**3 / 3.0
-            noise[axis, axis + 2] = noise[axis + 2, axis] = q * elapsed_s**2 / 2.0
-            noise[axis + 2, axis + 2] = q * elapsed_s
+        noise = acceleration_noise(elapsed_s)
+        if not self.moving:
+            noise = np.diag([RANDOM_WALK_M2_PER_S * elapsed_s] * 2 + [0.0] * 2)
         return replace(
             self,
             state=move @ self.state,
@@ -129,12 +126,14 @@ class Estimate:
                     vehicle[1] + range_m * math.sin(target.bearing_rad),
                 )
             )
-        noise = measurement_noise(target, measured - vehicle[:2])
-        if self.moving and target.range_source in (self.source, RangeSource.NONE):
-            noise = noise * FRAME_TO_FRAME**2
+        same = target.range_source is RangeSource.NONE or (
+            target.range_source is self.source and self.source in _CORRELATED
+        )
+        alike = self.moving and same
+        noise = measurement_noise(target, measured - vehicle[:2], FRAME_TO_FRAME if alike else 1.0)
         innovation = measured - self.state[:2]
         spread = self.covariance[:2, :2] + noise
-        return Fit(float(innovation @ np.linalg.solve(spread, innovation)), target, innovation, spread)
+        return Fit(squared_distance(innovation, spread), target, innovation, spread)
 
     def update(self, fit: Fit) -> Estimate:
         """The estimate updated with a detection."""
@@ -152,8 +151,35 @@ class Estimate:
         return Estimate(state, covariance, self.captured_ns, source, self.moving)
 
 
-def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(2, 2) covariance of a measured position, given the vector from the vehicle to it."""
+def squared_distance(offset: Vector, covariance: Vector) -> float:
+    """Mahalanobis distance squared of a (2,) offset, by a (2, 2) covariance."""
+    (nn, ne), (_, ee) = covariance.tolist()
+    north, east = offset.tolist()
+    return float((ee * north * north - 2.0 * ne * north * east + nn * east * east) / (nn * ee - ne * ne))
+
+
+def acceleration_noise(elapsed_s: float) -> NDArray[np.float64]:
+    """(4, 4) covariance that an unknown acceleration adds to position and velocity in this time."""
+    q = ACCELERATION_M2_PER_S3
+    position, mixed, velocity = q * elapsed_s**3 / 3.0, q * elapsed_s**2 / 2.0, q * elapsed_s
+    return np.array(
+        (
+            (position, 0.0, mixed, 0.0),
+            (0.0, position, 0.0, mixed),
+            (mixed, 0.0, velocity, 0.0),
+            (0.0, mixed, 0.0, velocity),
+        )
+    )
+
+
+def measurement_noise(
+    target: Target, line_of_sight: NDArray[np.float64], share: float = 1.0
+) -> NDArray[np.float64]:
+    """(2, 2) covariance of a measured position, given the vector from the vehicle to it.
+
+    Args:
+        share: of its error that differs from one frame to the next.
+    """
     range_m = max(NEAREST_M, float(np.hypot(*line_of_sight)))
     if target.range_source is RangeSource.NONE:
         sigma_along = UNKNOWN_RANGE_SIGMA_M
@@ -163,4 +189,5 @@ def measurement_noise(target: Target, line_of_sight: NDArray[np.float64]) -> NDA
         sigma_along = math.hypot(UNSTATED_SIGMA[0], UNSTATED_SIGMA[1] * range_m)
     sigma_across = math.hypot(ACROSS_SIGMA_M, BEARING_SIGMA_RAD * range_m)
     bearing_rad = math.atan2(line_of_sight[1], line_of_sight[0])
-    return position_covariance(bearing_rad, sigma_along, sigma_across)
+    least_m = JITTER_M if target.range_source is RangeSource.DEPTH else 0.0
+    return position_covariance(bearing_rad, max(share * sigma_along, least_m), share * sigma_across)

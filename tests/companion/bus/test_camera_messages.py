@@ -21,8 +21,8 @@ from companion.bus.messages import (
 )
 from companion.bus.vehicle_messages import geodetic_origin
 from companion.geometry.geodesy import GeodeticOrigin, north_east
+from companion.guidance.objects.table import ObjectTable
 from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
-from companion.guidance.targets.fused import FusedTracks
 from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.state import VehicleState
@@ -216,8 +216,8 @@ def test_track_events_have_the_fused_position() -> None:
         "car", 0.9, NOW_NS, 0.0, -0.3, 20.0, RangeSource.GROUND_PLANE, (20.0, 0.0, 0.0),
         track_id=7, range_sigma_m=2.0, across_sigma_m=0.4, vehicle_sigma_m=0.3,
     )  # fmt: skip
-    fused, origin = FusedTracks(), GeodeticOrigin(47.4, 8.5, 500.0)
-    fused.update([target], (0.0, 0.0, -5.0), NOW_NS)
+    objects, origin = ObjectTable(), GeodeticOrigin(47.4, 8.5, 500.0)
+    objects.update([target], (0.0, 0.0, -5.0), NOW_NS)
     box = (1.0, 2.0, 3.0, 4.0)
     events = tuple(
         TrackEvent(
@@ -231,7 +231,7 @@ def test_track_events_have_the_fused_position() -> None:
         replace(two_cars(), track_events=events),
         "v",
         NOW_NS,
-        localization=Localization((target,), "", origin, fused),
+        localization=Localization((target,), "", origin, objects),
     )
     check_message("tracks", message)
     ours, other = message["events"]

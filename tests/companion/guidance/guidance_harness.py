@@ -34,6 +34,7 @@ from companion.guidance.interface import (
 )
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.mode_control import Phase
+from companion.guidance.objects.table import ObjectTable
 from companion.guidance.targets.target import Target
 from companion.service.requests import apply_output
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame
@@ -299,6 +300,7 @@ class GuidanceHarness:
         self.streaming = True
         self.perception_age_s: float | None = 0.05
         self.results: dict[int, Outcome] = {}
+        self.table, self.marker_table = ObjectTable(), ObjectTable()
         self._class_names, self._inputs = class_names, inputs
         self._identifiers = itertools.count(1)
 
@@ -336,7 +338,7 @@ class GuidanceHarness:
             ending=ending,
             standstill=seen.standstill,
         )
-        output = self.guidance.step(now_ns, self._inputs(inputs))
+        output = self.guidance.step(now_ns, self._with_objects(self._inputs(inputs)))
         apply_output(
             output,
             self.streamer,
@@ -351,6 +353,17 @@ class GuidanceHarness:
         self.outputs.append(output)
         self.results |= {result.identifier: result.outcome for result in output.results}
         return output
+
+    def _with_objects(self, inputs: GuidanceInput) -> GuidanceInput:
+        """The input with the objects that its targets and markers are, as `InputAssembler` makes them."""
+        if inputs.seen_ns is not None:
+            captured_ns = inputs.targets[0].captured_ns if inputs.targets else inputs.seen_ns
+            self.table.update(inputs.targets, self.vehicle.position_ned_m, captured_ns)
+        markers = inputs.steering_markers
+        seen = [marker.as_target() for marker in markers.targets]
+        if markers.captured_ns:
+            self.marker_table.update(seen, self.vehicle.position_ned_m, markers.captured_ns)
+        return replace(inputs, objects=self.table.objects, marker_objects=self.marker_table.objects)
 
     def _state(self) -> VehicleState:
         """The vehicle's state, stamped by the companion's clock."""

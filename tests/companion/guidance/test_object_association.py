@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.guidance.targets.target import RangeSource, Target
-from companion.guidance.targets.track import ObjectTrack
 from companion.vehicle.state import Vector3
+from tests.companion.guidance.one_object import OneObject
 
 T0 = 10**12
 FRAME_NS = 100_000_000
@@ -41,16 +41,21 @@ def test_range_sigma_weights_the_measurement() -> None:
     vehicle = (0.0, 0.0, -5.0)
     positions = []
     for sigma_m in (0.2, 3.0):
-        track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+        track = OneObject(seen((20.0, 0.0)), vehicle)
         assert track.update([replace(seen((21.0, 0.0), frame=1), range_sigma_m=sigma_m)], vehicle)
         positions.append(track.position_ned_m[0])
     assert positions[0] > 20.7
     assert positions[1] < 20.2
 
 
-def test_track_needs_an_initial_position() -> None:
-    with pytest.raises(ValueError, match="no range"):
-        ObjectTrack(seen((5.0, 0.0), source=RangeSource.NONE), (0.0, 0.0, -5.0))
+def test_object_without_a_range_has_no_position() -> None:
+    vehicle = (0.0, 0.0, -5.0)
+    track = OneObject(replace(seen((5.0, 0.0), source=RangeSource.NONE), track_id=1), vehicle)
+    assert track.now.position_ned_m is None
+    with pytest.raises(ValueError, match="no known range"):
+        track.now.position_at(T0)
+    assert track.update([replace(seen((5.0, 0.0), frame=1), track_id=1)], vehicle)
+    assert track.position_ned_m == pytest.approx((5.0, 0.0, 0.0))
 
 
 @given(st.floats(-30, 30), st.floats(-30, 30), st.floats(0, 6.28))
@@ -58,7 +63,7 @@ def test_repeated_measurements_converge(north: float, east: float, direction: fl
     truth = (north, east)
     start = (north + math.cos(direction), east + math.sin(direction))
     vehicle = (-40.0, -40.0, -5.0)
-    track = ObjectTrack(seen(start, vehicle), vehicle)
+    track = OneObject(seen(start, vehicle), vehicle)
     for frame in range(1, 40):
         assert track.update([seen(truth, vehicle, frame)], vehicle)
     assert math.dist(track.position_ned_m[:2], truth) < 0.3
@@ -66,7 +71,7 @@ def test_repeated_measurements_converge(north: float, east: float, direction: fl
 
 def test_processed_frame_changes_nothing() -> None:
     vehicle = (0.0, 0.0, -5.0)
-    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    track = OneObject(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((20.5, 0.0), frame=0)], vehicle)
     assert track.update([seen((20.5, 0.0), frame=1)], vehicle)
     position = track.position_ned_m
@@ -77,23 +82,24 @@ def test_processed_frame_changes_nothing() -> None:
 @pytest.mark.parametrize("source", list(RangeSource))
 def test_object_in_another_direction_is_rejected(source: RangeSource) -> None:
     vehicle = (0.0, 0.0, -5.0)
-    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    track = OneObject(seen((20.0, 0.0)), vehicle)
     assert not track.update([seen((18.0, 9.0), frame=1, source=source)], vehicle)
     assert not track.update([seen((20.0, 0.0), frame=2, name="truck")], vehicle)
 
 
 def test_nearer_of_two_candidates_is_associated() -> None:
     vehicle = (0.0, 0.0, -5.0)
-    track = ObjectTrack(seen((20.0, 0.0)), vehicle)
+    track = OneObject(seen((20.0, 0.0)), vehicle)
     assert track.update([seen((20.0, 1.5), frame=1), seen((20.2, 0.1), frame=1)], vehicle)
     assert track.position_ned_m[1] == pytest.approx(0.05, abs=0.1)
 
 
 def test_bearing_alone_corrects_only_across() -> None:
     vehicle = (0.0, 0.0, -5.0)
-    track = ObjectTrack(seen((20.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    track = OneObject(replace(seen((20.0, 0.0), source=RangeSource.DEPTH), track_id=1), vehicle)
     for frame in range(1, 20):
-        assert track.update([seen((10.0, 0.4), vehicle, frame, source=RangeSource.NONE)], vehicle)
+        bearing = seen((10.0, 0.4), vehicle, frame, source=RangeSource.NONE)
+        assert track.update([replace(bearing, track_id=1)], vehicle)
     north, east, _ = track.position_ned_m
     assert math.atan2(east, north) == pytest.approx(math.atan2(0.4, 10.0), abs=0.01)
     assert math.hypot(north, east) == pytest.approx(20.0, abs=0.1)
@@ -101,8 +107,8 @@ def test_bearing_alone_corrects_only_across() -> None:
 
 def test_long_unseen_object_may_have_moved() -> None:
     vehicle = (0.0, 0.0, -5.0)
-    near = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
-    late = ObjectTrack(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    near = OneObject(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
+    late = OneObject(seen((10.0, 0.0), source=RangeSource.DEPTH), vehicle)
     moved = (10.0, 3.5)
     assert not near.update([seen(moved, frame=1, source=RangeSource.DEPTH)], vehicle)
     assert late.update([seen(moved, frame=30, source=RangeSource.DEPTH)], vehicle)
@@ -113,7 +119,7 @@ def test_box_on_the_object_may_replace_it_and_one_beside_may_not(left: float, sa
     vehicle = (0.0, 0.0, -5.0)
     first = replace(seen((10.0, 0.0)), track_id=1, box_xyxy=(300.0, 100.0, 340.0, 200.0))
     second = replace(seen((10.0, 0.4)), track_id=2, box_xyxy=(left, 100.0, left + 60.0, 200.0))
-    track = ObjectTrack(first, vehicle)
+    track = OneObject(first, vehicle)
     both = [replace(target, captured_ns=T0 + FRAME_NS) for target in (first, second)]
     assert track.update(both, vehicle)
     assert track.track_id == 1

@@ -7,9 +7,12 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.targets.choosing import CHOOSING_S, TargetSelector
-from companion.guidance.targets.moving_track import DOUBT_S, MovingTrack
+from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
+from companion.guidance.objects.table import DOUBT_S, ObjectTable
+from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.targets.chosen import Wanted
 from companion.guidance.targets.target import RangeSource, Target
+from tests.companion.guidance.one_object import OneObject
 
 SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
 
@@ -37,7 +40,7 @@ class Road:
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        self.track = MovingTrack(seen(self.car, self.vehicle, 0.0, 1), self.vehicle)
+        self.track = OneObject(seen(self.car, self.vehicle, 0.0, 1), self.vehicle)
 
     @property
     def car(self) -> tuple[float, float]:
@@ -57,11 +60,12 @@ class Road:
                     for name, (north, east) in beside.items()
                 ],
                 self.vehicle,
+                round(self.seconds * 1e9),
             )
 
     @property
     def off_m(self) -> float:
-        return math.dist(self.track.position_at(round(self.seconds * 1e9)), self.car)
+        return math.dist(self.track.now.position_at(round(self.seconds * 1e9))[:2], self.car)
 
 
 @pytest.fixture
@@ -123,9 +127,12 @@ def test_own_id_without_a_rival_is_followed_in_a_turn(road: Road, turn_deg: floa
         road.seconds += FRAME_S
         road.track.update([seen(car(FRAME_S * index), (*corner, -4.0), road.seconds, 1)], (*corner, -4.0))
     now_ns = round(road.seconds * 1e9)
-    assert road.track.captured_ns == now_ns
-    assert math.dist(road.track.position_at(now_ns), car(3.0)) < 0.5
-    assert math.dist(road.track.velocity, (SPEED_MPS * math.cos(turn), SPEED_MPS * math.sin(turn))) < 0.6
+    assert road.track.now.last_ns == now_ns
+    assert math.dist(road.track.now.position_at(now_ns)[:2], car(3.0)) < 0.5
+    assert (
+        math.dist(road.track.now.velocity_ned_mps, (SPEED_MPS * math.cos(turn), SPEED_MPS * math.sin(turn)))
+        < 0.6
+    )
 
 
 def test_own_id_far_off_is_refused_beside_a_rival(road: Road) -> None:
@@ -186,41 +193,43 @@ def test_changed_range_source_widens_the_gate(road: Road) -> None:
     assert road.off_m == pytest.approx(2.0, abs=0.7)
 
 
-def test_often_ambiguous_object_is_not_selected() -> None:
-    vehicle = (0.0, 0.0, -4.0)
+def choose(frames: list[list[Target]]) -> TrackedObject | None:
+    """The car that is chosen by the last frame, nose to the north."""
+    table, found = ObjectTable(), None
+    choices: dict[Wanted, Choice] = {}
+    for index, targets in enumerate(frames):
+        now_ns = round((index + 1) * FRAME_S * 1e9)
+        stamped = [replace(target, captured_ns=now_ns) for target in targets]
+        objects = table.update(stamped, (0.0, 0.0, -4.0), now_ns)
+        found = ObjectsInView(objects, (), now_ns, 0.0, choices).of(Wanted("car"))
+    return found
 
-    def chosen(doubts: str) -> Target | None:
-        selector, found = TargetSelector(), None
-        for frame, doubt in enumerate(doubts):
-            target = replace(seen((20.0, 0.0), vehicle, frame * FRAME_S, 3), trusted=doubt != "?")
-            found = selector.update([target], 0.0, round(frame * FRAME_S * 1e9))
-        return found
+
+def test_often_ambiguous_object_is_not_chosen() -> None:
+    def chosen(doubts: str) -> TrackedObject | None:
+        car = seen((20.0, 0.0), (0.0, 0.0, -4.0), 0.0, 3)
+        return choose([[replace(car, trusted=doubt != "?")] for doubt in doubts])
 
     assert chosen("?????.?????????") is None
     assert chosen("??.........") is not None
     assert chosen("??..?......") is not None
 
 
-def test_without_ranges_the_smallest_angle_is_selected() -> None:
-    aside = Target("car", 0.9, 1, math.radians(9.5), -0.3, track_id=None)
-    ahead = replace(aside, bearing_rad=math.radians(0.2))
-    assert TargetSelector().update([aside, ahead], 0.0, 1) is ahead
+def test_without_ranges_the_smallest_angle_is_chosen() -> None:
+    aside = Target("car", 0.9, 1, math.radians(9.5), -0.3, track_id=1)
+    ahead = replace(aside, bearing_rad=math.radians(0.2), track_id=2)
+    found = choose([[aside, ahead]] * 8)
+    assert found is not None
+    assert (found.track_id, found.position_ned_m) == (2, None)
 
 
-def test_nearest_object_ahead_is_selected() -> None:
-    vehicle = (0.0, 0.0, -4.0)
-
-    def chosen(*positions: tuple[float, float]) -> tuple[float, float]:
-        selector = TargetSelector()
-        found = None
-        for frame in range(round(CHOOSING_S / FRAME_S) + 2):
-            targets = [
-                seen(position, vehicle, frame * FRAME_S, index) for index, position in enumerate(positions)
-            ]
-            found = selector.update(targets, 0.0, round(frame * FRAME_S * 1e9))
+def test_nearest_object_ahead_is_chosen() -> None:
+    def chosen(*positions: tuple[float, float]) -> tuple[float, ...]:
+        targets = [seen(place, (0.0, 0.0, -4.0), 0.0, index) for index, place in enumerate(positions)]
+        found = choose([targets] * (round(CHOOSING_S / FRAME_S) + 2))
         assert found is not None
         assert found.position_ned_m is not None
-        return found.position_ned_m[:2]
+        return tuple(round(value, 3) for value in found.position_ned_m[:2])
 
     assert chosen((56.0, 1.0), (10.0, 0.9)) == (10.0, 0.9)
     # Away from the nose only the direction counts.

@@ -1,0 +1,212 @@
+"""Where one object is: two models of its motion, fed with the detections that are associated with it.
+
+A moving object has a Kalman filter's position and velocity (`Estimate`). A standing one has the position of
+all its detections, each weighted by its information. Most errors of two frames have one cause: attitude,
+height, the object's size. Covariance intersection with equal weights (Julier & Uhlmann 1997) holds for any
+correlation: the covariance is the inverse of the mean information, and the position is the one that
+independent errors would give. Slow motion leaves that position behind the object, so detections are
+forgotten, and one that disagrees begins again.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.targets.estimate import (
+    FIRST_VELOCITY_SIGMA_MPS,
+    JITTER_M,
+    RANDOM_WALK_M2_PER_S,
+    Estimate,
+    Fit,
+    measurement_noise,
+    squared_distance,
+)
+from companion.guidance.targets.target import RangeSource, Target
+from companion.vehicle.state import Vector3
+
+# An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that
+# flies towards a standing object show as some tenths of its own speed.
+MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
+# Or if it was displaced at that speed for so long: a slow detector gives no sure speeds.
+DISPLACED_S = 1.5
+# Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
+MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
+# A detection this many sigma from the fused position shows that the object has moved.
+RESTART_SIGMA = 3.0
+# Not seen whole, with a range, for so long an object may be anywhere, although it is still detected.
+STALE_S = 2.5
+# A box at the image's upper edge shows a part of an object if it is lower than this share of the newest box
+# that the edge did not cut off: of an object that leaves at the top, half of its width may be detected last.
+PART = 0.5
+
+
+class PositionFilter:
+    """Position and velocity of one object.
+
+    Attributes:
+        motion: of the moving model, at the newest detection.
+        moving: the object moves.
+        located_ns: capture of the newest detection that showed all of it with a range.
+
+    Raises:
+        ValueError: the first target has no range.
+    """
+
+    def __init__(self, target: Target, vehicle: Vector3) -> None:
+        self._begin(target, vehicle, 0.0)
+
+    def restart(self, detections: Sequence[tuple[Target, Vector3]]) -> None:
+        """Begin again at the last of these, each with the vehicle's position; their spread is an error."""
+        target, vehicle = detections[-1]
+        places = [other.position_ned_m[:2] for other, _ in detections if other.position_ned_m is not None]
+        spread = np.cov(places, rowvar=False)
+        self._begin(target, vehicle, spread)
+        self.motion.covariance[:2, :2] += spread
+
+    def _begin(self, target: Target, vehicle: Vector3, spread: NDArray[np.float64] | float) -> None:
+        self.motion = Estimate.initialize(target, vehicle)
+        self.moving, self._cut = False, target.cut
+        self._whole_height = 0.0
+        self._was: deque[tuple[int, NDArray[np.float64]]] = deque([(target.captured_ns, self.motion.state)])
+        self._begin_fusion()
+        assert target.position_ned_m is not None
+        self._fuse(np.array(target.position_ned_m[:2]), _covariance(target, vehicle) + spread)
+        self._note_whole(target)
+
+    def update(self, expected: Estimate, fit: Fit, vehicle: Vector3) -> None:
+        """Add a detection.
+
+        Where the image's edge cuts a box off, an object seems to move: such a detection, and one of a small
+        part, counts for a standing object's position only until it is seen whole.
+
+        Args:
+            expected: `motion` at its capture. fit: the detection in it.
+        """
+        target = fit.target
+        self.motion = expected.update(fit)
+        if target.position_ned_m is None:
+            # Across the line of sight a bearing counts as much as a position.
+            place = expected.state[:2] + fit.innovation
+            covariance = measurement_noise(target, place - vehicle[:2])
+            if self._disagrees(place, covariance):
+                self._begin_fusion()
+                place, covariance = self.motion.state[:2], self.motion.covariance[:2, :2]
+            self._fuse(place, covariance)
+            return
+        if (target.cut and not self._cut) or self.is_part(target):
+            if target.captured_ns - self.located_ns > STALE_S * 1e9:
+                # Where it was seen whole says nothing any more.
+                self.moving = self._moves(target.captured_ns)
+                self._begin_fusion()
+                self._fuse(self.motion.state[:2], self.motion.covariance[:2, :2])
+            return
+        place, covariance = np.array(target.position_ned_m[:2]), _covariance(target, vehicle)
+        self.moving = self._moves(target.captured_ns)
+        if self.moving or self._disagrees(place, covariance):
+            self._begin_fusion()
+        self._forget((target.captured_ns - self.located_ns) / 1e9)
+        self._fuse(place, covariance)
+        self._note_whole(target)
+
+    def _moves(self, now_ns: int) -> bool:
+        while len(self._was) > 1 and now_ns - self._was[1][0] >= DISPLACED_S * 1e9:
+            self._was.popleft()
+        self._was.append((now_ns, self.motion.state))
+        since_ns, then = self._was[0]
+        elapsed_s = (now_ns - since_ns) / 1e9
+        displaced_m = math.hypot(*(self.motion.state - then)[:2])
+        if elapsed_s >= DISPLACED_S and displaced_m > MOVING_MPS * elapsed_s:
+            return True
+        speed_sigma_mps = math.sqrt(float(np.trace(self.motion.covariance[2:, 2:])))
+        return math.hypot(*self.motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
+
+    def at(self, now_ns: int, *, unseen: bool) -> list[Estimate]:
+        """Where it may be: on its way; and, after a while `unseen`, where it stood, unless it surely moves.
+
+        From frame to frame the way is right; a noisy speed leads an unseen object away.
+        """
+        ways = [self.motion.at(now_ns)]
+        if unseen and not self.moving:
+            place, fused = self._fused()
+            elapsed_s = (now_ns - self.motion.captured_ns) / 1e9
+            covariance = np.diag([0.0] * 2 + [FIRST_VELOCITY_SIGMA_MPS**2] * 2)
+            covariance[:2, :2] = fused + np.eye(2) * RANDOM_WALK_M2_PER_S * elapsed_s
+            state = np.concatenate([place, (0.0, 0.0)])
+            ways.append(Estimate(state, covariance, now_ns, self.motion.source, True))
+        return ways
+
+    def begins_again(self, target: Target) -> bool:
+        """Whether this is the first detection that the image's edge does not cut off."""
+        return self._cut and not target.cut and target.position_ned_m is not None
+
+    def is_part(self, target: Target) -> bool:
+        """Whether the middle of this box is not the object's."""
+        return target.cut_above and _height(target) < PART * self._whole_height
+
+    def state(self) -> tuple[Vector3, NDArray[np.float64]]:
+        """Position in local NED, and (4, 4) covariance of north, east and their velocities."""
+        # The filter's own covariance is from frame to frame: what all frames share is in the detections'.
+        place, fused = self._fused()
+        if self.moving:
+            place = self.motion.state[:2]
+        else:
+            # How far the newest detections are from the fused position is part of its error.
+            behind = self.motion.state[:2] - place
+            fused = fused + np.outer(behind, behind)
+        covariance = self.motion.covariance.copy()
+        covariance[:2, :2] = fused
+        covariance[:2, :2] += np.eye(2) * self._vehicle_sigma_m**2
+        return (float(place[0]), float(place[1]), self._down_m), covariance
+
+    def _fused(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Position and covariance of the mean information."""
+        covariance = np.asarray(np.linalg.inv(self._information / self._count), np.float64)
+        return covariance @ (self._weighted / self._count), covariance
+
+    def _disagrees(self, measured: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        place, fused = self._fused()
+        away = measured - place
+        spread = fused + covariance + np.eye(2) * JITTER_M**2
+        return squared_distance(away, spread) > RESTART_SIGMA**2
+
+    def _begin_fusion(self) -> None:
+        self._information, self._weighted, self._count = np.zeros((2, 2)), np.zeros(2), 0.0
+
+    def _forget(self, elapsed_s: float) -> None:
+        by_depth = self.motion.source in (RangeSource.DEPTH, RangeSource.MARKER)
+        kept = math.exp(-elapsed_s / (MEMORY_OF_DEPTH_S if by_depth else MEMORY_S))
+        self._information, self._weighted = self._information * kept, self._weighted * kept
+        self._count *= kept
+
+    def _fuse(self, measured: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+        information = np.linalg.inv(covariance)
+        self._information = self._information + information
+        self._weighted = self._weighted + information @ measured
+        self._count += 1
+
+    def _note_whole(self, target: Target) -> None:
+        assert target.position_ned_m is not None
+        self._down_m = target.position_ned_m[2]
+        self.located_ns, self._vehicle_sigma_m = target.captured_ns, target.vehicle_sigma_m
+        if not target.cut_above:
+            self._whole_height = _height(target)
+
+
+def _covariance(target: Target, vehicle: Vector3) -> NDArray[np.float64]:
+    """(2, 2) covariance of a position: as stated, else by the kind of its range."""
+    stated = target.position_covariance
+    if stated is not None:
+        return stated
+    assert target.position_ned_m is not None
+    return measurement_noise(target, np.array(target.position_ned_m[:2]) - vehicle[:2])
+
+
+def _height(target: Target) -> float:
+    """Of its box, in pixels at a range of 1 m, so that it is the same from near and far."""
+    _, top, _, bottom = target.box_xyxy
+    return (bottom - top) * target.ground_range_m

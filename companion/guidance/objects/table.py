@@ -1,0 +1,504 @@
+"""The objects that one camera shows: detections are told apart, associated and filtered once, here.
+
+The image tracker's ids have priority. An object whose id ends is predicted; a detection with an id that is
+new since then may be the object, if it is near where the object is expected and no other detection fits about
+as well. What was seen beside an object is another one for ever. After an occlusion the association is a
+hypothesis for a while: if another detection then fits the prediction far better, the two are exchanged.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from companion.guidance.objects.position_filter import PositionFilter
+from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.targets.estimate import Estimate, Fit
+from companion.guidance.targets.target import Target
+from companion.vehicle.state import Vector3
+from vision.attitude import wrap_angle
+
+# Unseen, the gate grows without bound: a new track id is associated no farther than this from the expected
+# position, plus so much per second; and not after an object has been unseen for longer than LONGEST_S.
+REACH_M, REACH_MPS, LONGEST_S = 1.5, 1.0, 10.0
+# Of two detections near the expected position one is associated only if it fits better by this factor. Below
+# these squared distances fits count as equal (in general; after an occlusion).
+CLEARLY_NEARER = 3.0
+AS_GOOD, AS_GOOD_AGAIN = 0.3, 0.1
+# χ² with two degrees of freedom: 99 % of the object's own detections are inside the first; the image
+# tracker's id is trusted within the second, 90 %, because ids switch where two cars pass each other.
+GATE, SURE_GATE = 9.2, 4.6
+# Unseen for this long, and at least so many frames, the image tracker's id may have switched.
+IDENTITY_S, IDENTITY_FRAMES = 0.5, 4
+# Occlusion: unseen for longer than this, then off the expected position or with another id. The association
+# stays a hypothesis for DOUBT_S.
+OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
+# Two boxes of a frame within this bearing, or that overlap by this IoU, may be of one object: the detector
+# finds some of them twice.
+SAME_BEARING_RAD, ONE_OBJECT_IOU = 0.03, 0.5
+# Without a tracker a detection within this bearing of an object that is not seen otherwise may be it.
+DIRECTION_RAD = 0.1
+# An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
+# while they fit each other: the filter begins again there.
+REFUSED = 3
+# An object is forgotten after this long, and the longest unseen one where there are more than so many.
+FORGET_S, MOST_OBJECTS = 60.0, 256
+
+
+class _Occlusion(NamedTuple):
+    """The estimate before an occlusion, and the objects known then, until the association is certain."""
+
+    estimate: Estimate
+    others: frozenset[int]
+    until_ns: float
+
+
+class _Object:
+    """What the table remembers of one object."""
+
+    def __init__(self, object_id: int, target: Target, vehicle: Vector3) -> None:
+        self.object_id = object_id
+        self.class_name = target.class_name
+        self.track_ids: tuple[int, ...] = () if target.track_id is None else (target.track_id,)
+        self.first_ns = self.last_ns = target.captured_ns
+        self.newest = target
+        self.confirmed = target.trusted
+        self._trusted, self._doubted = int(target.trusted), 0
+        self.ambiguous = False
+        self.filter = None if target.position_ned_m is None else PositionFilter(target, vehicle)
+        self.occlusion: _Occlusion | None = None
+        self.refused: list[tuple[Target, Vector3]] = []
+        self._intervals_s: deque[float] = deque(maxlen=5)
+        self._value: TrackedObject | None = None
+
+    @property
+    def track_id(self) -> int | None:
+        return self.track_ids[-1] if self.track_ids else None
+
+    @property
+    def interval_s(self) -> float:
+        """Interval between detections without occlusion."""
+        return min(self._intervals_s, default=0.0)
+
+    def unseen_s(self, now_ns: int) -> float:
+        return (now_ns - self.last_ns) / 1e9
+
+    def believes_id(self, now_ns: int) -> bool:
+        """Whether it was seen so lately that the image tracker's id is still its own."""
+        return self.unseen_s(now_ns) <= max(IDENTITY_S, IDENTITY_FRAMES * self.interval_s)
+
+    def was_occluded(self, now_ns: int) -> bool:
+        return self.unseen_s(now_ns) > max(OCCLUDED_S, OCCLUDED_FRAMES * self.interval_s)
+
+    def see(self, target: Target, *, ambiguous: bool = False) -> None:
+        """Note a detection of it; its position is the filter's."""
+        self._intervals_s.append(self.unseen_s(target.captured_ns))
+        self.last_ns, self.newest = target.captured_ns, target
+        self.refused = []
+        if target.track_id is not None and target.track_id != self.track_id:
+            self.track_ids = (*(each for each in self.track_ids if each != target.track_id), target.track_id)
+        self.confirmed = self.confirmed or target.trusted
+        self._trusted += target.trusted
+        self._doubted += self.confirmed and not target.trusted
+        self.ambiguous = ambiguous or not target.trusted
+        self._value = None
+
+    def value(self, newest_ns: int) -> TrackedObject:
+        occluded = self.last_ns < newest_ns
+        known = self._value
+        if known is not None and known.occluded == occluded and known.ambiguous == self.ambiguous:
+            return known
+        position, covariance = None, np.zeros((4, 4))
+        if self.filter is not None:
+            position, covariance = self.filter.state()
+        covariance_rows = tuple(map(tuple, covariance.tolist()))
+        self._value = TrackedObject(
+            self.object_id,
+            self.track_ids,
+            self.class_name,
+            position,
+            (0.0, 0.0) if self.filter is None else self.filter.motion.velocity,
+            covariance_rows,
+            self.filter is not None and self.filter.moving,
+            0 if self.filter is None else self.filter.located_ns,
+            self.first_ns,
+            self.last_ns,
+            self.confirmed,
+            self.ambiguous,
+            self._doubted / max(1, self._doubted + self._trusted),
+            occluded,
+            self.newest,
+        )
+        return self._value
+
+
+class ObjectTable:
+    """The objects of one camera, from frame to frame.
+
+    Attributes:
+        objects: what `update` returned.
+    """
+
+    def __init__(self) -> None:
+        self._objects: dict[int, _Object] = {}
+        self._owners: dict[int, _Object] = {}
+        self._newest_ns = -1
+        self._next_id = 1
+        self.objects: tuple[TrackedObject, ...] = ()
+
+    def update(
+        self, targets: Sequence[Target], vehicle: Vector3, captured_ns: int
+    ) -> tuple[TrackedObject, ...]:
+        """Add one frame; a frame that is not newer than the last one changes nothing.
+
+        Args:
+            targets: all of this capture; empty: the camera saw nothing.
+            vehicle: its position at the capture, local NED.
+            captured_ns: of the frame.
+
+        Returns:
+            Those of this frame, and the confirmed ones of the last `LONGEST_S`, the oldest first, each as of
+            its newest detection.
+        """
+        if captured_ns > self._newest_ns:
+            self._newest_ns = captured_ns
+            _Frame(self, targets, vehicle, captured_ns).associate()
+            self._forget()
+            self.objects = tuple(
+                each.value(captured_ns)
+                for each in self._objects.values()
+                if each.last_ns == captured_ns or (each.confirmed and each.unseen_s(captured_ns) <= LONGEST_S)
+            )
+        return self.objects
+
+    def of_track(self, track_id: int) -> TrackedObject | None:
+        """The object that has, or had, an id of the image tracker."""
+        owner = self._owners.get(track_id)
+        return None if owner is None else owner.value(self._newest_ns)
+
+    def _forget(self) -> None:
+        ended = [
+            each
+            for each in self._objects.values()
+            if each.unseen_s(self._newest_ns) > (FORGET_S if each.confirmed else LONGEST_S)
+        ]
+        if (excess := len(self._objects) - len(ended) - MOST_OBJECTS) > 0:
+            left = sorted(self._objects.values(), key=lambda each: each.last_ns)
+            ended = [*ended, *[each for each in left if each not in ended][:excess]]
+        for each in ended:
+            self._remove(each)
+
+    def _add(self, target: Target, vehicle: Vector3) -> _Object:
+        created = _Object(self._next_id, target, vehicle)
+        self._next_id += 1
+        self._objects[created.object_id] = created
+        if target.track_id is not None:
+            self._owners[target.track_id] = created
+        return created
+
+    def _remove(self, gone: _Object) -> None:
+        del self._objects[gone.object_id]
+        for track_id in gone.track_ids:
+            if self._owners.get(track_id) is gone:
+                del self._owners[track_id]
+
+
+class _Frame:
+    """The association of one frame's detections with the objects of a table."""
+
+    def __init__(
+        self, table: ObjectTable, targets: Sequence[Target], vehicle: Vector3, captured_ns: int
+    ) -> None:
+        self._table, self._vehicle, self._now_ns = table, vehicle, captured_ns
+        self._left = _with_unique_ids(target for target in targets if target.captured_ns == captured_ns)
+        self._seen: dict[int, Target] = {}  # by object
+        self._ways: dict[int, list[Estimate]] = {}
+        self._fits: dict[tuple[int, int], tuple[Estimate, Fit]] = {}
+
+    def associate(self) -> None:
+        objects = self._table._objects
+        for each in list(objects.values()):
+            if each.occlusion is not None:
+                self._exchange(each, each.occlusion)
+        for target in list(self._left):
+            self._take_own(target)
+        self._take_new()
+        for target in list(self._left):
+            self._refuse_or_add(target)
+
+    def _fit(self, known: _Object, target: Target) -> tuple[Estimate, Fit]:
+        """How well a detection fits an object with a position, and where that was expected for it."""
+        key = known.object_id, id(target)
+        if key not in self._fits:
+            ways = self._ways.get(known.object_id)
+            if ways is None:
+                assert known.filter is not None
+                ways = known.filter.at(self._now_ns, unseen=known.was_occluded(self._now_ns))
+                self._ways[known.object_id] = ways
+            fits = [(way, way.fit(target, self._vehicle)) for way in ways]
+            self._fits[key] = min(fits, key=lambda pair: pair[1].squared)
+        return self._fits[key]
+
+    def _owner(self, target: Target) -> _Object | None:
+        return None if target.track_id is None else self._table._owners.get(target.track_id)
+
+    def _take(self, known: _Object, target: Target) -> None:
+        """A detection is of this object."""
+        if known.filter is not None and not known.filter.begins_again(target):
+            expected, fit = self._fit(known, target)
+            self._note_occlusion(known, target, fit)
+            known.filter.update(expected, fit, self._vehicle)
+        elif target.position_ned_m is not None:
+            known.filter = PositionFilter(target, self._vehicle)
+        known.see(target)
+        if target.track_id is not None:
+            self._table._owners[target.track_id] = known
+        self._seen[known.object_id] = target
+        self._left = [each for each in self._left if each is not target]
+
+    def _note_occlusion(self, known: _Object, target: Target, fit: Fit) -> None:
+        surely = target.track_id == known.track_id and fit.squared <= EXPECTED_GATE
+        if known.occlusion is None and not surely and known.was_occluded(self._now_ns):
+            assert known.filter is not None
+            others = {
+                each.object_id
+                for each in self._table._objects.values()
+                if each is not known and each.first_ns <= known.last_ns
+            }
+            until_ns = self._now_ns + DOUBT_S * 1e9
+            known.occlusion = _Occlusion(known.filter.motion, frozenset(others), until_ns)
+
+    def _take_own(self, target: Target) -> None:
+        """The detection with an object's own id, where it is expected."""
+        known = self._owner(target)
+        if known is None or known.track_id != target.track_id or known.object_id in self._seen:
+            return
+        if (
+            known.filter is None
+            or known.filter.begins_again(target)
+            or (known.believes_id(self._now_ns) and self._fit(known, target)[1].squared <= SURE_GATE)
+        ):
+            self._take(known, target)
+
+    def _take_new(self) -> None:
+        """The other detections near where objects are expected that have not been seen yet in this frame."""
+        chosen: dict[int, list[tuple[_Object, Fit]]] = {}
+        for known in list(self._table._objects.values()):
+            if known.object_id in self._seen or known.filter is None:
+                continue
+            fits = self._fitting(known)
+            # Without a tracker nothing but the distance tells them apart.
+            told_apart = [fit for fit in fits if fit.target.track_id is not None]
+            known.ambiguous = len(told_apart) > 1 and _alike(fits[0], fits[1])
+            if fits and not known.ambiguous:
+                chosen.setdefault(id(fits[0].target), []).append((known, fits[0]))
+        for pairs in chosen.values():
+            pairs.sort(key=lambda pair: pair[1].squared)
+            known, fit = pairs[0]
+            if len(pairs) > 1 and fit.target.track_id is not None and _alike(fit, pairs[1][1]):
+                own = [pair for pair in pairs if pair[0].track_id == fit.target.track_id is not None]
+                if len(own) != 1:
+                    for each, _ in pairs:
+                        each.ambiguous = True
+                    continue
+                known, fit = own[0]
+            young = self._owner(fit.target)
+            if young is not None and young is not known and young.object_id in self._seen:
+                self._merge(young, known)
+            self._take(known, fit.target)
+
+    def _fitting(self, known: _Object) -> list[Fit]:
+        """The detections that may be an object which is not seen with its own id, the best fit first."""
+        unseen_s = known.unseen_s(self._now_ns)
+        if unseen_s > LONGEST_S:
+            return []
+        reach_m = REACH_M + REACH_MPS * unseen_s
+        fits = []
+        for target in (*self._left, *self._seen.values()):
+            if target.class_name != known.class_name:
+                continue
+            own = target.track_id is not None and target.track_id == known.track_id
+            if not own and not self._may_be(known, target):
+                continue
+            _, fit = self._fit(known, target)
+            near = fit.off_m <= reach_m
+            if (
+                own
+                and (
+                    fit.squared <= GATE
+                    if known.believes_id(self._now_ns)
+                    else fit.squared <= SURE_GATE and near
+                )
+            ) or (not own and fit.squared <= GATE and near):
+                fits.append(fit)
+        return sorted(fits, key=lambda fit: fit.squared)
+
+    def _may_be(self, known: _Object, target: Target) -> bool:
+        """Whether a detection may be this object: its id is newer than the object's last detection."""
+        if not known.confirmed or not target.trusted:
+            return False
+        if target.position_ned_m is None and target.track_id is not None:
+            return False
+        owner = self._owner(target)
+        return owner is None or owner.first_ns > known.last_ns or owner.track_id != target.track_id
+
+    def _merge(self, young: _Object, known: _Object) -> None:
+        """Two objects are one: the older one goes on."""
+        del self._seen[young.object_id]
+        self._table._remove(young)
+        for track_id in young.track_ids:
+            self._table._owners[track_id] = known
+        known.track_ids = (
+            *known.track_ids,
+            *(each for each in young.track_ids if each not in known.track_ids),
+        )
+
+    def _refuse_or_add(self, target: Target) -> None:
+        """A detection that no object has taken: a manoeuvre of its owner, a second box, or a new object."""
+        known = self._owner(target) if target.track_id is not None else self._in_direction(target)
+        if (
+            known is not None
+            and known.track_id == target.track_id
+            and known.object_id not in self._seen
+            and (known.refused or known.believes_id(self._now_ns))
+        ):
+            if known.filter is None:
+                self._take(known, target)
+            elif not known.ambiguous:
+                self._manoeuvre(known, target)
+            return
+        if not self._is_second_box(target):
+            if known is not None and target.track_id is not None:
+                known.track_ids = tuple(each for each in known.track_ids if each != target.track_id)
+            created = self._table._add(target, self._vehicle)
+            self._seen[created.object_id] = target
+
+    def _manoeuvre(self, known: _Object, target: Target) -> None:
+        """Begin again where the image tracker sees the object, if the filter has refused it several times.
+
+        The filter expects a bounded acceleration; an object that turns or stops at once leaves its gate. The
+        image tracker has not lost it, so the filter is wrong.
+        """
+        assert known.filter is not None
+        if target.position_ned_m is None or not target.trusted or known.filter.is_part(target):
+            known.refused = []
+            return
+        if any(
+            Estimate.initialize(other, seen_from).at(self._now_ns).fit(target, self._vehicle).squared > GATE
+            for other, seen_from in known.refused
+        ):
+            known.refused = []
+        known.refused.append((target, self._vehicle))
+        if len(known.refused) < REFUSED:
+            return
+        known.filter.restart(known.refused)
+        known.occlusion = None
+        known.see(target)
+        self._seen[known.object_id] = target
+
+    def _in_direction(self, target: Target) -> _Object | None:
+        """Without a tracker: the object of its class, not seen in this frame, in its direction."""
+        near = [
+            (off_rad, each.object_id, each)
+            for each in self._table._objects.values()
+            if each.object_id not in self._seen
+            and not each.track_ids
+            and each.class_name == target.class_name
+            and (off_rad := abs(wrap_angle(each.newest.bearing_rad - target.bearing_rad))) < DIRECTION_RAD
+        ]
+        return min(near)[2] if near else None
+
+    def _is_second_box(self, target: Target) -> bool:
+        """Whether a new id is a second box on an object of this frame."""
+        return any(
+            other.class_name == target.class_name
+            and (
+                (
+                    abs(wrap_angle(other.bearing_rad - target.bearing_rad)) <= SAME_BEARING_RAD
+                    and abs(other.elevation_rad - target.elevation_rad) <= SAME_BEARING_RAD
+                )
+                or _overlap(other, target) >= ONE_OBJECT_IOU
+            )
+            for other in self._seen.values()
+        )
+
+    def _exchange(self, known: _Object, occlusion: _Occlusion) -> None:
+        """Take another detection that fits the prediction before the occlusion far better."""
+        if self._now_ns > occlusion.until_ns:
+            known.occlusion = None
+            return
+        assert known.filter is not None
+        before, present = occlusion.estimate.at(self._now_ns), known.filter.motion.at(self._now_ns)
+        seen = [t for t in self._left if t.class_name == known.class_name and t.position_ned_m is not None]
+        seen = [t for t in seen if (o := self._owner(t)) is None or o.object_id not in occlusion.others]
+        followed = self._followed(known, seen, present)
+        if followed is not None:
+            current = before.fit(followed, self._vehicle).squared
+        else:
+            aside = present.state[:2] - before.state[:2]
+            current = float(aside @ np.linalg.solve(before.covariance[:2, :2], aside))
+        rivals = [before.fit(t, self._vehicle) for t in seen if t is not followed and t.trusted]
+        rivals.sort(key=lambda fit: fit.squared)
+        if not rivals:
+            return
+        best, unseen_s = rivals[0], (self._now_ns - occlusion.estimate.captured_ns) / 1e9
+        bar = CLEARLY_NEARER * max(best.squared, AS_GOOD_AGAIN)
+        if best.squared > SURE_GATE or best.off_m > REACH_M + REACH_MPS * unseen_s:
+            return
+        if current <= bar or any(rival.squared <= bar for rival in rivals[1:]):
+            return
+        # The other one goes on as an object of its own, with the id that it has.
+        young = self._owner(best.target)
+        if young is not None and young is not known:
+            self._table._remove(young)
+        if known.track_id is not None and known.track_id != best.target.track_id:
+            self._table._owners.pop(known.track_id, None)
+            known.track_ids = known.track_ids[:-1]
+        known.occlusion = None
+        known.filter.update(before, best, self._vehicle)
+        known.see(best.target)
+        if best.target.track_id is not None:
+            self._table._owners[best.target.track_id] = known
+        self._seen[known.object_id] = best.target
+        self._left = [each for each in self._left if each is not best.target]
+
+    def _followed(self, known: _Object, seen: Sequence[Target], present: Estimate) -> Target | None:
+        """The detection of the current association: the one with its id, or the nearest within `REACH_M`."""
+        fits = [present.fit(target, self._vehicle) for target in seen]
+        for fit in fits:
+            own = fit.target.track_id is not None and fit.target.track_id == known.track_id
+            if own and fit.squared <= GATE:
+                return fit.target
+        near = [fit for fit in fits if fit.off_m <= REACH_M]
+        return min(near, key=lambda fit: fit.off_m).target if near else None
+
+
+def _alike(best: Fit, second: Fit) -> bool:
+    """Whether two fits are too similar to prefer one."""
+    return second.squared < CLEARLY_NEARER * max(best.squared, AS_GOOD)
+
+
+def _with_unique_ids(targets: Iterable[Target]) -> list[Target]:
+    """Of two detections with one id in a frame, the one with the higher confidence."""
+    kept: dict[int | None, list[Target]] = {}
+    for target in targets:
+        same = kept.setdefault(target.track_id, [])
+        if target.track_id is None or not same:
+            same.append(target)
+        elif target.confidence > same[0].confidence:
+            same[0] = target
+    return [target for same in kept.values() for target in same]
+
+
+def _overlap(one: Target, other: Target) -> float:
+    """IoU of two boxes."""
+    left, top, right, bottom = one.box_xyxy
+    left2, top2, right2, bottom2 = other.box_xyxy
+    width, height = min(right, right2) - max(left, left2), min(bottom, bottom2) - max(top, top2)
+    if width <= 0.0 or height <= 0.0:
+        return 0.0
+    both = width * height
+    return both / ((right - left) * (bottom - top) + (right2 - left2) * (bottom2 - top2) - both)

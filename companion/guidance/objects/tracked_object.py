@@ -1,0 +1,100 @@
+"""An object as it is flown to, published, drawn and recorded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from companion.guidance.objects.position_filter import STALE_S
+from companion.guidance.targets.estimate import acceleration_noise
+from companion.guidance.targets.target import RangeSource, Target
+from companion.vehicle.state import Vector3
+from vision.geolocation import ErrorEllipse
+
+
+@dataclass(frozen=True, slots=True)
+class TrackedObject:
+    """One object at the capture of its newest detection. Local NED, metres, CLOCK_MONOTONIC nanoseconds.
+
+    Attributes:
+        object_id: stays the same while the image tracker changes its ids.
+        track_ids: the image tracker's ids that it had, the newest last; empty without a tracker.
+        class_name: from the detector.
+        position_ned_m: None without a range so far. Of a standing object it is fused over its detections.
+        velocity_ned_mps: north and east, also where the object does not count as `moving`.
+        covariance: (4, 4) of north, east and their velocities, the vehicle's own position error included.
+        moving: its estimated speed is more than its error explains.
+        located_ns: capture of the newest detection that showed all of it with a range; 0: none.
+        first_ns, last_ns: capture of its first and its newest detection.
+        confirmed: it may be selected as a goal (`Target.trusted`), in this frame or in one before.
+        ambiguous: its newest detection may be of another class, or two detections fit it equally.
+        doubt: share of its detections since it was first confirmed in which it was ambiguous, 0..1.
+        occluded: it is not in the newest frame.
+        detection: its newest detection.
+    """
+
+    object_id: int
+    track_ids: tuple[int, ...]
+    class_name: str
+    position_ned_m: Vector3 | None
+    velocity_ned_mps: tuple[float, float]
+    covariance: tuple[tuple[float, ...], ...]
+    moving: bool
+    located_ns: int
+    first_ns: int
+    last_ns: int
+    confirmed: bool
+    ambiguous: bool
+    doubt: float
+    occluded: bool
+    detection: Target
+
+    @property
+    def track_id(self) -> int | None:
+        """The image tracker's id of the object now; None without one."""
+        return self.track_ids[-1] if self.track_ids else None
+
+    @property
+    def range_source(self) -> RangeSource:
+        """Of the newest detection."""
+        return self.detection.range_source
+
+    @property
+    def speed_sigma_mps(self) -> float:
+        """One sigma of the velocity along the longer axis of its ellipse."""
+        return math.sqrt(max(0.0, float(np.linalg.eigvalsh(np.array(self.covariance)[2:, 2:])[-1])))
+
+    def unseen_s(self, now_ns: int) -> float:
+        """How long ago it was detected."""
+        return max(0.0, (now_ns - self.last_ns) / 1e9)
+
+    def located(self, now_ns: int) -> bool:
+        """Whether its position is not older than its newest detection by more than `STALE_S`.
+
+        Args:
+            now_ns: of that detection, if it is newer than those of the object.
+        """
+        newest_ns = max(now_ns, self.last_ns)
+        return self.position_ned_m is not None and newest_ns - self.located_ns <= STALE_S * 1e9
+
+    def position_at(self, now_ns: int) -> Vector3:
+        """Where it is expected: a moving object goes on. Raises ValueError without a position."""
+        if self.position_ned_m is None:
+            raise ValueError(f"object {self.object_id}, a {self.class_name}, has no known range")
+        if not self.moving:
+            return self.position_ned_m
+        north, east, down = self.position_ned_m
+        north_mps, east_mps = self.velocity_ned_mps
+        ahead_s = self.unseen_s(now_ns)
+        return (north + ahead_s * north_mps, east + ahead_s * east_mps, down)
+
+    def ellipse_at(self, now_ns: int) -> ErrorEllipse:
+        """The horizontal error of `position_at`."""
+        elapsed_s = self.unseen_s(now_ns)
+        move = np.eye(4)
+        move[0, 2] = move[1, 3] = elapsed_s
+        covariance: NDArray[np.float64] = move @ np.array(self.covariance) @ move.T
+        return ErrorEllipse.of((covariance + acceleration_noise(elapsed_s))[:2, :2])
