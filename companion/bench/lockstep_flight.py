@@ -137,6 +137,7 @@ class LockstepFlight:
         self.events: list[GuidanceEvent] = []
         self.state_words: list[str] = []
         self.begun_ns = driver.now_ns
+        self._scene_begun_ns: int | None = driver.now_ns
         self._identifiers = itertools.count(1)
         self._new: list[CommandInput] = []
         self._ending = False
@@ -214,6 +215,14 @@ class LockstepFlight:
         """Since the newest command of `fly`."""
         return (self.driver.now_ns - self.begun_ns) / 1e9
 
+    @property
+    def scene_seconds(self) -> float:
+        """Time of what moves in the scene: as `seconds`; 0 while the vehicle turns and perception warms up.
+
+        Otherwise everything would jump back to its beginning when the command is given.
+        """
+        return 0.0 if self._scene_begun_ns is None else (self.driver.now_ns - self._scene_begun_ns) / 1e9
+
     # --- commands ----------------------------------------------------------------------------------------
 
     def command(self, command: str | Behaviour) -> int:
@@ -253,8 +262,11 @@ class LockstepFlight:
             warm_up_s: perception is at work before the command comes.
         """
         log = FlightLog()
+        self._scene_begun_ns = None
         self.run(warm_up_s)
         self.begun_ns = self.now_ns
+        if not isinstance(command, _Turn):
+            self._scene_begun_ns = self.now_ns
         identifier = self.command(command)
         while self.seconds < limit_s:
             stepped = self.tick()

@@ -73,7 +73,7 @@ class RenderedCamera:
         self.perception.select(request)
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
-        time_s = flight.seconds if self._by_flight else None
+        time_s = flight.scene_seconds if self._by_flight else None
         taken = self.perception.capture(flight.now_ns, time_s=time_s)
         self.shown = self.shown if taken is None else taken.rendered
 

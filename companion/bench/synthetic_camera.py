@@ -64,7 +64,7 @@ class SyntheticCamera:
             self._attitudes.add(state.attitude_ns, state.attitude)
 
     def capture(self, flight: LockstepFlight) -> Callable[[], PerceptionResult | None]:
-        captured_ns, seconds, truth = flight.now_ns, flight.seconds, flight.vehicle.truth
+        captured_ns, seconds, truth = flight.now_ns, flight.scene_seconds, flight.vehicle.truth
         freeze = flight.vehicle.vehicle.faults.camera_freeze
         self._sequence += 1
         sequence = self._sequence

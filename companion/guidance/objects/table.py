@@ -253,11 +253,18 @@ class _Frame:
             known.filter.update(expected, fit, self._vehicle)
         elif target.position_ned_m is not None:
             known.filter = PositionFilter(target, self._vehicle)
+        self._own(known, target)
+        self._left = [each for each in self._left if each is not target]
+
+    def _own(self, known: _Object, target: Target) -> None:
+        """Note that this is the object's detection in this frame; an id of another object is now its own."""
+        owner = self._owner(target)
+        if owner is not None and owner is not known:
+            owner.track_ids = tuple(each for each in owner.track_ids if each != target.track_id)
         known.see(target)
         if target.track_id is not None:
             self._table._owners[target.track_id] = known
         self._seen[known.object_id] = target
-        self._left = [each for each in self._left if each is not target]
 
     def _note_occlusion(self, known: _Object, target: Target, fit: Fit) -> None:
         surely = target.track_id == known.track_id and fit.squared <= EXPECTED_GATE
@@ -337,13 +344,21 @@ class _Frame:
         return sorted(fits, key=lambda fit: fit.squared)
 
     def _may_be(self, known: _Object, target: Target) -> bool:
-        """Whether a detection may be this object: its id is newer than the object's last detection."""
+        """Whether a detection may be this object.
+
+        Its id is newer than the object's last detection; or its owner is expected elsewhere, so that the id
+        has gone to another object.
+        """
         if not known.confirmed or not target.trusted:
             return False
         if target.position_ned_m is None and target.track_id is not None:
             return False
         owner = self._owner(target)
-        return owner is None or owner.first_ns > known.last_ns or owner.track_id != target.track_id
+        if owner is None or owner.first_ns > known.last_ns or owner.track_id != target.track_id:
+            return True
+        if owner.filter is None or owner.filter.begins_again(target):
+            return False
+        return target.position_ned_m is not None and self._fit(owner, target)[1].squared > GATE
 
     def _merge(self, young: _Object, known: _Object) -> None:
         """Two objects are one: the older one goes on."""
@@ -396,8 +411,7 @@ class _Frame:
             return
         known.filter.restart(known.refused)
         known.occlusion = None
-        known.see(target)
-        self._seen[known.object_id] = target
+        self._own(known, target)
 
     def _in_direction(self, target: Target) -> _Object | None:
         """Without a tracker: the object of its class, not seen in this frame, in its direction."""
@@ -459,10 +473,7 @@ class _Frame:
             known.track_ids = known.track_ids[:-1]
         known.occlusion = None
         known.filter.update(before, best, self._vehicle)
-        known.see(best.target)
-        if best.target.track_id is not None:
-            self._table._owners[best.target.track_id] = known
-        self._seen[known.object_id] = best.target
+        self._own(known, best.target)
         self._left = [each for each in self._left if each is not best.target]
 
     def _followed(self, known: _Object, seen: Sequence[Target], present: Estimate) -> Target | None:
