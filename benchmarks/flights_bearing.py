@@ -23,7 +23,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviours.orbit import OrbitBehaviour
-from companion.guidance.targets.from_detections import StateHistory
+from companion.guidance.objects.from_detections import StateHistory
 from companion.vehicle.state import VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount

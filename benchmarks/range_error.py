@@ -8,7 +8,7 @@ headings, 3 to 25 m away, in the whole width of the image. Boxes are the detecto
 that agree with the truth in class and by an IoU of 0.5, of objects of which 60 % is seen; boxes that the
 image's edge cuts are among them. Depth is that of a stereo camera with a baseline of 5 cm (`DepthSensor`).
 The pose is exact, but for the share of errors within the targets' own sigma it has the errors that
-`companion/guidance/targets/range_error.py` states: tilt, heading and height above home. The truth is the
+`companion/guidance/objects/range_error.py` states: tilt, heading and height above home. The truth is the
 horizontal distance from the vehicle to the nearest point of the object's surface, or to its footprint, the
 rectangle around it (`--truth footprint`).
 
@@ -27,9 +27,9 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.from_detections import StateHistory, targets_from_detections
-from companion.guidance.targets.range_error import PoseError
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.from_detections import StateHistory, targets_from_detections
+from companion.guidance.objects.range_error import PoseError
+from companion.guidance.objects.target import Target
 from companion.settings.perception import DetectorSection
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth

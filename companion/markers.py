@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 
 from companion.bus.messages import board_body, marker_body
-from companion.guidance.targets.from_detections import StateHistory
-from companion.guidance.targets.from_markers import BoardTarget, MarkerTarget, board_targets, marker_targets
+from companion.guidance.objects.from_detections import StateHistory
+from companion.guidance.objects.from_markers import BoardTarget, MarkerTarget, board_targets, marker_targets
 from companion.perception.assembly import marker_finder
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration

@@ -158,7 +158,7 @@ def attitudes_of(settings: Settings) -> Iterator[CameraTelemetry]:
         LinkError: no heartbeat or no attitude was received within `vehicle.connect_timeout_s`, or the link
             cannot be opened.
     """
-    from companion.guidance.targets.from_detections import HistoryError, StateHistory
+    from companion.guidance.objects.from_detections import HistoryError, StateHistory
     from companion.service.factory import driver_of
     from companion.vehicle.driver import LinkUnavailableError
 

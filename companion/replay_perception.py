@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.bus.topics import STATUS
-from companion.guidance.targets.from_detections import HistoryError, StateHistory
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.from_detections import HistoryError, StateHistory
+from companion.guidance.objects.target import RangeSource, Target
 from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 from companion.perception.cameras import PerceptionCamera, threads_each
 from companion.perception.process import RateLimiter

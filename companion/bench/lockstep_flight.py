@@ -26,7 +26,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.mode_control import Phase
 from companion.guidance.motion import position_and_yaw
-from companion.guidance.targets.from_detections import StateHistory
+from companion.guidance.objects.from_detections import StateHistory
 from companion.perception.cameras import PerceptionCamera
 from companion.service.factory import guidance_options, streamer_of
 from companion.service.inputs import InputAssembler

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_perception import RenderedPerception
-from companion.guidance.targets.from_detections import HistoryError, StateHistory
+from companion.guidance.objects.from_detections import HistoryError, StateHistory
 from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import VehicleState

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
+from companion.guidance.objects.from_detections import HistoryError, StateHistory, mount_at
 from companion.perception.cameras import PerceptionCamera
 from companion.settings import Settings
 from companion.vehicle.state import Vector3, VehicleState

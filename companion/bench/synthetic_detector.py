@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.from_detections import CONTACT_INSET_M
+from companion.guidance.objects.from_detections import CONTACT_INSET_M
 from companion.vehicle.state import Quaternion, Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import Detections

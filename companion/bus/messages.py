@@ -30,11 +30,11 @@ from companion.bus.bodies.frames import (
 from companion.bus.bodies.vehicle import ObstaclesBody
 from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
+from companion.guidance.objects.from_detections import StateHistory, mount_at
+from companion.guidance.objects.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
 from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.from_detections import StateHistory, mount_at
-from companion.guidance.targets.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
-from companion.guidance.targets.target import Target
 from companion.vehicle.clock_sync import ClockOffset
 from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.objects.closing_check import Approached
+from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.in_view import ObjectsInView
-from companion.guidance.targets.chosen import NO_TRACKS, RecentTracks, Wanted
-from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
-from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
+from companion.guidance.objects.subject import NO_TRACKS, RecentTracks, Subject
+from companion.guidance.objects.target import Target
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
@@ -148,13 +148,13 @@ class BehaviourContext:
     parameters: AutopilotParameters = NOTHING_READ
     objects: ObjectsInView = field(default_factory=ObjectsInView)
 
-    def targets_of(self, wanted: Wanted) -> tuple[Target, ...]:
+    def targets_of(self, wanted: Subject) -> tuple[Target, ...]:
         """The newest frame's targets among which those of a command are."""
         if wanted.marker_id is None:
             return self.targets
         return tuple(marker.as_target() for marker in self.steering_markers.targets)
 
-    def fresh(self, wanted: Wanted) -> bool:
+    def fresh(self, wanted: Subject) -> bool:
         """Whether that frame is not too old."""
         return self.perception_fresh if wanted.marker_id is None else self.steering_markers.fresh
 
@@ -229,7 +229,7 @@ class RoutedSetpoint:
 BehaviourOutput = Setpoint | RoutedSetpoint | ModeRequest | Outcome
 
 
-def needs_to_see(wanted: Wanted) -> frozenset[Requirement]:
+def needs_to_see(wanted: Subject) -> frozenset[Requirement]:
     """The requirements of a behaviour that flies to an object."""
     if wanted.marker_id is not None:
         return frozenset({Requirement.STEERING_MARKER})

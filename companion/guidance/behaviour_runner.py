@@ -19,8 +19,8 @@ from companion.guidance.command_queue import CommandQueue
 from companion.guidance.interface import Answer, CommandInput, EventKind, GuidanceInput, OutputCollector
 from companion.guidance.limits.battery import ENDINGS, BatteryMinimum, BatteryMonitor
 from companion.guidance.mode_control import ModeControl, Phase
+from companion.guidance.objects.closing_check import Approached
 from companion.guidance.setpoint_output import SetpointOutput
-from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from companion.vehicle.streamer import StreamState

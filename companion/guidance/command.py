@@ -25,8 +25,8 @@ from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_ty
 
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
+from companion.guidance.objects.subject import GimbalGoal
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets.chosen import GimbalGoal
 from vision.class_names import class_named, near_names
 from vision.registry import RegistrationError
 

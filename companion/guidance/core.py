@@ -32,12 +32,12 @@ from companion.guidance.limits.battery import NO_MINIMUM, BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.guidance.mode_control import ModeControl, Phase
+from companion.guidance.objects.closing_check import ClosingCheck
 from companion.guidance.objects.in_view import Choice, ObjectsInView
+from companion.guidance.objects.subject import RecentTracks, Subject
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
-from companion.guidance.targets.chosen import RecentTracks, Wanted
-from companion.guidance.targets.closing_check import ClosingCheck
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 from vision.obstacle_sectors import ObstacleSectors
@@ -87,7 +87,7 @@ class Guidance:
         self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._objects: tuple[TrackedObject, ...] = ()
         self._marker_objects: tuple[TrackedObject, ...] = ()
-        self._choices: dict[Wanted, Choice] = {}
+        self._choices: dict[Subject, Choice] = {}
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
         # Of the steering camera, and of those that look down.

@@ -9,12 +9,12 @@ from typing import Literal
 from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
+from companion.guidance.objects.subject import GimbalGoal
+from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets.chosen import GimbalGoal
-from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
-from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.targets.target import Target
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget

@@ -15,14 +15,14 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from companion.guidance.objects.table import ObjectTable
-from companion.guidance.targets.from_detections import (
+from companion.guidance.objects.from_detections import (
     HistoryError,
     StateHistory,
     targets_from_detections,
 )
-from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans, sees_ground
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.target import Target
 from companion.load import with_load
 from companion.perception.messages import AnyPreview
 from companion.perception.process import START_S

@@ -8,17 +8,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-from companion.guidance.objects.table import ObjectTable
-from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.from_detections import HistoryError, StateHistory, mount_at
-from companion.guidance.targets.from_map import (
+from companion.guidance.objects.from_detections import HistoryError, StateHistory, mount_at
+from companion.guidance.objects.from_map import (
     TURNED_RAD,
     VisionGate,
     map_origin_ned_m,
     position_from_map,
     tilt_error_rad,
 )
-from companion.guidance.targets.from_markers import (
+from companion.guidance.objects.from_markers import (
     CONFIRM_FRAMES,
     CONFIRM_GAP_S,
     NO_MARKERS,
@@ -30,6 +28,8 @@ from companion.guidance.targets.from_markers import (
     looks_down,
     marker_targets,
 )
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.perception.cameras import PerceptionCamera
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vision_position import VisionPosition

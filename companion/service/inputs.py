@@ -17,10 +17,10 @@ from companion.guidance.command import BuildContext, Command, GrammarError
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
+from companion.guidance.objects.from_detections import StateHistory
+from companion.guidance.objects.from_markers import LocalizedMarkers
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
-from companion.guidance.targets.from_detections import StateHistory
-from companion.guidance.targets.from_markers import LocalizedMarkers
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.freeze_reports import FreezeReports
 from companion.perception.marker_tracker import MarkerTracker

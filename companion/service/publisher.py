@@ -34,8 +34,8 @@ from companion.bus.vehicle_messages import (
     vehicle_message,
 )
 from companion.guidance.core import Guidance
-from companion.guidance.targets.from_detections import HistoryError
-from companion.guidance.targets.from_markers import LocalizedMarkers
+from companion.guidance.objects.from_detections import HistoryError
+from companion.guidance.objects.from_markers import LocalizedMarkers
 from companion.perception.cameras import WorkerCamera
 from companion.perception.messages import AnyPreview, CloudPreview, DepthPreview
 from companion.perception.supervisor import PerceptionState

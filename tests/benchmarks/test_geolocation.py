@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.geolocation import MOUNT, _located_by_pose, _Shown
-from companion.guidance.targets.from_detections import Pose
-from companion.guidance.targets.range_error import PoseError
+from companion.guidance.objects.from_detections import Pose
+from companion.guidance.objects.range_error import PoseError
 from mavlink_sim.camera.renderer import Rendered
 from vision.rotation import matrix_from_euler
 

@@ -27,10 +27,10 @@ from companion.guidance.motion import (
     stopping_point,
     stopping_speed,
 )
+from companion.guidance.objects.closing_check import Approached
+from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.target import RangeSource
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.target import RangeSource
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -83,7 +83,7 @@ class ApproachBehaviour(Behaviour):
         tracking: GimbalTracking | None = None,
     ) -> None:
         self._tracking = tracking
-        self._subject = Wanted(class_name, track_id, marker_id)
+        self._subject = Subject(class_name, track_id, marker_id)
         self.requirements = ApproachBehaviour.requirements | needs_to_see(self._subject)
         if tracking is not None:
             self.requirements |= {Requirement.GIMBAL}

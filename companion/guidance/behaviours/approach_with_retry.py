@@ -28,8 +28,8 @@ from companion.guidance.gimbal.pitch import (
     GimbalUse,
 )
 from companion.guidance.motion import position_and_yaw, stay_at
+from companion.guidance.objects.closing_check import Approached
 from companion.guidance.search_pattern import field_of_view_rad
-from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 from companion.guidance.behaviour import BehaviourContext
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.target import Target
 from vision.attitude import wrap_angle
 
 # Number of frames within the window that must agree on a direction.

@@ -25,8 +25,8 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.chosen import Wanted
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
@@ -146,7 +146,7 @@ class FollowBehaviour(Behaviour):
         tracking: GimbalTracking | None = None,
     ) -> None:
         self._tracking = tracking
-        self._subject = Wanted(class_name, track_id, marker_id)
+        self._subject = Subject(class_name, track_id, marker_id)
         self.requirements = FollowBehaviour.requirements | needs_to_see(self._subject)
         if tracking is not None:
             self.requirements |= {Requirement.GIMBAL}

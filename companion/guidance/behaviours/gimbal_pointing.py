@@ -22,7 +22,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
 from companion.guidance.gimbal.pointing import Pointing
-from companion.guidance.targets.chosen import GimbalGoal, GlobalPoint, Wanted
+from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject
 from companion.vehicle.gimbal import GimbalAim
 
 
@@ -71,7 +71,7 @@ class Gimbal(Command):
     def aim(self) -> GimbalGoal:
         """Where to point it."""
         if self.track_id is not None or self.class_name is not None:
-            return Wanted(self.class_name or "", self.track_id)
+            return Subject(self.class_name or "", self.track_id)
         if self.latitude_deg is not None and self.longitude_deg is not None:
             return GlobalPoint(self.latitude_deg, self.longitude_deg, self.altitude_m or 0.0)
         return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))
@@ -90,7 +90,7 @@ class PointGimbalBehaviour(HoldBehaviour):
         super().__init__()
         self._goal, self._pointing = goal, Pointing(goal)
         self._problem: str | None = None
-        if isinstance(goal, Wanted):
+        if isinstance(goal, Subject):
             self.track_id, self.class_names = goal.track_id, goal.class_names
         elif isinstance(goal, GimbalAim):
             self.gimbal_pitches_rad = (goal.pitch_rad,)

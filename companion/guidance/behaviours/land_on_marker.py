@@ -24,9 +24,9 @@ from companion.guidance.behaviour import (
 from companion.guidance.behaviours.marker_search import MarkerSearch
 from companion.guidance.command import BuildContext, Command, EnumArgument, GrammarError, Number, behaviour
 from companion.guidance.motion import correction, position_and_yaw, towards
-from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.from_markers import MarkerTarget
-from companion.guidance.targets.pad_filter import PadFilter
+from companion.guidance.objects.closing_check import Approached
+from companion.guidance.objects.from_markers import MarkerTarget
+from companion.guidance.objects.pad_filter import PadFilter
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3

@@ -34,8 +34,8 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.chosen import Wanted
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -151,7 +151,7 @@ class OrbitBehaviour(Behaviour):
         needs = {Requirement.POSITION, Requirement.IN_AIR}
         self._subject = None
         if class_name or track_id is not None or marker_id is not None:
-            self._subject = Wanted(class_name, track_id, marker_id)
+            self._subject = Subject(class_name, track_id, marker_id)
             needs |= needs_to_see(self._subject)
         self.requirements = frozenset(needs)
         self.class_names, self.track_id = ((class_name,) if class_name else ()), track_id

@@ -24,8 +24,8 @@ from companion.guidance.command import (
     names_in,
 )
 from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
-from companion.guidance.targets.closing_check import Approached
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.closing_check import Approached
+from companion.guidance.objects.target import Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 

@@ -26,10 +26,10 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.motion import Arrival, position_and_yaw, speed_of
+from companion.guidance.objects.closing_check import Approached
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
-from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.closing_check import Approached
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
@@ -76,7 +76,7 @@ class Policy(Command):
                     f"{loaded.name} steps at {rate_hz:g} Hz, guidance only at {loop_hz:g} Hz: "
                     "set guidance.rate_hz to at least that of the policy"
                 )
-            wanted = Wanted(self.class_name, self.track_id)
+            wanted = Subject(self.class_name, self.track_id)
             return PolicyBehaviour(loaded, wanted, distance_m=self.distance_m, limit_s=self.limit_s)
         except PolicyError as error:
             raise GrammarError(f"policy: {error}") from error
@@ -122,7 +122,7 @@ class PolicyBehaviour(Behaviour):
 
     name = "policy"
 
-    def __init__(self, policy: LoadedPolicy, wanted: Wanted, *, distance_m: float, limit_s: float) -> None:
+    def __init__(self, policy: LoadedPolicy, wanted: Subject, *, distance_m: float, limit_s: float) -> None:
         self._policy, self._wanted = policy, wanted
         self._distance_m, self._limit_s = distance_m, limit_s
         self.requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR}) | needs_to_see(wanted)

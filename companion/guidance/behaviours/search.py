@@ -20,9 +20,9 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
 from companion.guidance.motion import ground_speed, position_and_yaw, stay_at
+from companion.guidance.objects.target import DOUBTED
 from companion.guidance.path import Path
 from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
-from companion.guidance.targets.target import DOUBTED
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 

@@ -14,7 +14,7 @@ from companion.guidance.behaviours.confirmation import (
 )
 from companion.guidance.gimbal.pitch import GimbalSweep
 from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
-from companion.guidance.targets.target import DOUBTED, Target
+from companion.guidance.objects.target import DOUBTED, Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.command import EnumArgument
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
 

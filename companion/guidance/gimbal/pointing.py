@@ -6,8 +6,8 @@ import math
 
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.motion import home_of, local_from_global
-from companion.guidance.targets.chosen import GimbalGoal, GlobalPoint, Wanted, newest_of
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject, newest_of
+from companion.guidance.objects.target import Target
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from companion.vehicle.state import Vector3, VehicleState
 
@@ -43,14 +43,14 @@ class Pointing:
     @property
     def name(self) -> str:
         """`the person`, `track 17`, or `the place`."""
-        return self.goal.phrase if isinstance(self.goal, Wanted) else "the place"
+        return self.goal.phrase if isinstance(self.goal, Subject) else "the place"
 
     def begin(self, context: BehaviourContext) -> str | None:
         """Aim for the first time. Returns why that is not possible, in words; None: it is."""
         match self.goal:
             case GimbalAim():
                 return None
-            case Wanted():
+            case Subject():
                 why = _not_in_sight(self.goal, context)
             case GlobalPoint():
                 why = self._locate(self.goal, context) or self._beyond_reach(context)
@@ -61,7 +61,7 @@ class Pointing:
 
     def update(self, context: BehaviourContext) -> str | None:
         """Aim from where the vehicle is now. Returns why the goal is lost, in words; None: it is not."""
-        if isinstance(self.goal, Wanted):
+        if isinstance(self.goal, Subject):
             self._look(self.goal, context)
         elif isinstance(self.goal, GlobalPoint) and context.state.position_fault(context.now_ns) is None:
             self._known_ns = context.now_ns
@@ -75,7 +75,7 @@ class Pointing:
             self.aim = GimbalAim(pitch_rad, bearing_rad, YawFrame.NORTH)
         return None
 
-    def _look(self, wanted: Wanted, context: BehaviourContext) -> None:
+    def _look(self, wanted: Subject, context: BehaviourContext) -> None:
         """Remember the object's newest detection, and where that was."""
         now_ns, state = context.now_ns, context.state
         target = newest_of(wanted, self._seen, context.targets, context.tracks, now_ns)
@@ -131,10 +131,10 @@ class Pointing:
 
     @property
     def _is_track(self) -> bool:
-        return isinstance(self.goal, Wanted) and self.goal.track_id is not None
+        return isinstance(self.goal, Subject) and self.goal.track_id is not None
 
 
-def _not_in_sight(wanted: Wanted, context: BehaviourContext) -> str | None:
+def _not_in_sight(wanted: Subject, context: BehaviourContext) -> str | None:
     if wanted.track_id is not None:
         return context.tracks.missing(wanted.track_id, context.now_ns)
     if newest_of(wanted, None, context.targets, context.tracks, context.now_ns) is not None:

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.chosen import Wanted
 from vision.attitude import wrap_angle
 
 # Candidates are collected for this long from the first confirmed object on, because a detector misses frames.
@@ -31,7 +31,7 @@ class Choice:
 
     def update(
         self,
-        subject: Wanted,
+        subject: Subject,
         confidence: float,
         objects: Sequence[TrackedObject],
         now_ns: int,
@@ -76,9 +76,9 @@ class ObjectsInView:
     markers: tuple[TrackedObject, ...] = ()
     now_ns: int = 0
     yaw_rad: float = 0.0
-    _choices: dict[Wanted, Choice] = field(default_factory=dict, compare=False, repr=False)
+    _choices: dict[Subject, Choice] = field(default_factory=dict, compare=False, repr=False)
 
-    def of(self, subject: Wanted, confidence: float = 0.0) -> TrackedObject | None:
+    def of(self, subject: Subject, confidence: float = 0.0) -> TrackedObject | None:
         """The object that a command means; None: not chosen yet.
 
         Of a class it is the nearest confirmed one ahead. It stays the same until the command ends: unseen, it
@@ -89,7 +89,7 @@ class ObjectsInView:
         choice = self._choices.setdefault(subject, Choice())
         return choice.update(subject, confidence, among, self.now_ns, self.yaw_rad)
 
-    def shows(self, subject: Wanted) -> bool:
+    def shows(self, subject: Subject) -> bool:
         """Whether one of these is there, confirmed and with a known range, or was lately."""
         among = self.objects if subject.marker_id is None else self.markers
         return any(
@@ -100,7 +100,7 @@ class ObjectsInView:
             for each in among
         )
 
-    def forget(self, subject: Wanted) -> None:
+    def forget(self, subject: Subject) -> None:
         """Choose anew."""
         self._choices.pop(subject, None)
 

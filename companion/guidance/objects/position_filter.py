@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.estimate import (
+from companion.guidance.objects.estimate import (
     FIRST_VELOCITY_SIGMA_MPS,
     JITTER_M,
     RANDOM_WALK_M2_PER_S,
@@ -26,7 +26,7 @@ from companion.guidance.targets.estimate import (
     measurement_noise,
     squared_distance,
 )
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 
 # An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that

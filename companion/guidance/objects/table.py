@@ -14,10 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.guidance.objects.estimate import Estimate, Fit
 from companion.guidance.objects.position_filter import PositionFilter
+from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.estimate import Estimate, Fit
-from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 

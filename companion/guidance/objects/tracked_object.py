@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.guidance.objects.estimate import acceleration_noise
 from companion.guidance.objects.position_filter import STALE_S
-from companion.guidance.targets.estimate import acceleration_noise
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.geolocation import ErrorEllipse
 

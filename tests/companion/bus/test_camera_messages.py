@@ -21,9 +21,9 @@ from companion.bus.messages import (
 )
 from companion.bus.vehicle_messages import geodetic_origin
 from companion.geometry.geodesy import GeodeticOrigin, north_east
+from companion.guidance.objects.from_detections import HistoryError, StateHistory, targets_from_detections
 from companion.guidance.objects.table import ObjectTable
-from companion.guidance.targets.from_detections import HistoryError, StateHistory, targets_from_detections
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.gimbal import GimbalState
 from companion.vehicle.state import VehicleState
 from tests.companion.bus.message_check import check_message

@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator, ValidationError
 from companion.bus.bodies.service import CommandReplyBody, EventBody
 from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_markdown, write_schemas
 from companion.guidance.formation.pose import ROLES
-from companion.guidance.targets.target import RangeSource
+from companion.guidance.objects.target import RangeSource
 from tests.companion.bus.message_check import check_message, closed, validator
 from tests.companion.command_line import companion_here
 from vision.detections import TRACK_CONFIRMED, TRACK_NONE, TRACK_TENTATIVE

@@ -35,7 +35,7 @@ from companion.guidance.interface import (
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.mode_control import Phase
 from companion.guidance.objects.table import ObjectTable
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.target import Target
 from companion.service.requests import apply_output
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame
 from companion.vehicle.landing_target import LandingTarget

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from vision.attitude import quaternion_from_euler, wrap_angle

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.target import Target
 from companion.vehicle.state import Vector3
 
 

@@ -4,7 +4,7 @@ import random
 import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.targets.target import RangeSource
+from companion.guidance.objects.target import RangeSource
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

@@ -21,7 +21,7 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.interface import GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print

@@ -18,8 +18,8 @@ from companion.guidance.command import NO_CONTEXT, Command, GrammarError
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.grammar import json_schema, markdown, parse, usage
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.guidance.targets.chosen import RecentTracks, Wanted
-from companion.guidance.targets.ranging import RangeMeans
+from companion.guidance.objects.ranging import RangeMeans
+from companion.guidance.objects.subject import RecentTracks, Subject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, engaged, flying
@@ -285,7 +285,7 @@ def test_wanted_is_a_class_a_track_or_a_marker() -> None:
     for wrong in ({}, {"class_name": "car", "track_id": 1}, {"track_id": 1, "marker_id": 7}):
         got = f"{wrong.get('track_id')} and {wrong.get('marker_id')}"
         with pytest.raises(ValueError, match=f"class, .*marker, .* {got}$"):
-            Wanted(**wrong)
+            Subject(**wrong)
 
 
 def test_memory_of_tracks_is_bounded() -> None:
@@ -343,7 +343,7 @@ def test_gimbal_is_refused_for_a_track_that_is_not_there() -> None:
 def test_mission_step_points_the_gimbal_at_a_track() -> None:
     flight = gimbal_flight(person(0.0, 25.0))
     flight.run(2.0)
-    log = flight.fly(PointGimbalBehaviour(Wanted(track_id=1)), 15.0, warm_up_s=0.0)
+    log = flight.fly(PointGimbalBehaviour(Subject(track_id=1)), 15.0, warm_up_s=0.0)
     assert log.outcome is not None
     assert log.outcome.success, log.outcome.reason
     gimbal = flight.state.gimbal

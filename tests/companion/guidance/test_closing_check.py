@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from companion.guidance.targets.closing_check import LEAST_FLOWN_M, Approached, ClosingCheck
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.closing_check import LEAST_FLOWN_M, Approached, ClosingCheck
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 
 PERIOD_NS = 66_000_000

@@ -14,7 +14,7 @@ from companion.bench.lockstep_flight import FlightLog, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.grammar import json_schema, parse
-from companion.guidance.targets.target import UNCONFIRMED_MARKER
+from companion.guidance.objects.target import UNCONFIRMED_MARKER
 from companion.settings import Settings
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene

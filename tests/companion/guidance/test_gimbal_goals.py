@@ -19,7 +19,7 @@ from companion.guidance.behaviour import BehaviourContext, Outcome
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.gimbal.pointing import LOST_AFTER_S, Pointing
 from companion.guidance.grammar import parse
-from companion.guidance.targets.chosen import GlobalPoint, Wanted
+from companion.guidance.objects.subject import GlobalPoint, Subject
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.gimbal_flight import PERSON_M, gimbal_flight, person
 from tests.companion.guidance.guidance_harness import flying
@@ -201,7 +201,7 @@ def test_place_out_of_the_gimbals_reach_is_refused() -> None:
 @pytest.mark.parametrize(
     ("text", "goal"),
     [
-        ("gimbal class=person", Wanted("person")),
+        ("gimbal class=person", Subject("person")),
         ("gimbal latitude=47.5 longitude=-8.25", GlobalPoint(47.5, -8.25, 0.0)),
         ("gimbal latitude=47.5 longitude=8 altitude=-20m", GlobalPoint(47.5, 8.0, -20.0)),
         ("gimbal latitude=0 longitude=0", GlobalPoint(0.0, 0.0, 0.0)),

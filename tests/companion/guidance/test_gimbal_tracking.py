@@ -23,8 +23,8 @@ from companion.guidance.gimbal.pitch import GimbalTracking
 from companion.guidance.grammar import parse
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.objects.target import Target
 from companion.guidance.requirements import check_requirements
-from companion.guidance.targets.target import Target
 from companion.vehicle.gimbal import GimbalAim, GimbalState
 from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from companion.guidance.targets.from_detections import HistoryError, StateHistory
-from companion.guidance.targets.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
-from companion.guidance.targets.pad_filter import PadFilter
+from companion.guidance.objects.from_detections import HistoryError, StateHistory
+from companion.guidance.objects.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
+from companion.guidance.objects.pad_filter import PadFilter
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount

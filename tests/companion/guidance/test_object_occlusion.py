@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.table import DOUBT_S, ObjectTable
+from companion.guidance.objects.target import RangeSource, Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.chosen import Wanted
-from companion.guidance.targets.target import RangeSource, Target
 from tests.companion.guidance.one_object import OneObject
 
 SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
@@ -196,12 +196,12 @@ def test_changed_range_source_widens_the_gate(road: Road) -> None:
 def choose(frames: list[list[Target]]) -> TrackedObject | None:
     """The car that is chosen by the last frame, nose to the north."""
     table, found = ObjectTable(), None
-    choices: dict[Wanted, Choice] = {}
+    choices: dict[Subject, Choice] = {}
     for index, targets in enumerate(frames):
         now_ns = round((index + 1) * FRAME_S * 1e9)
         stamped = [replace(target, captured_ns=now_ns) for target in targets]
         objects = table.update(stamped, (0.0, 0.0, -4.0), now_ns)
-        found = ObjectsInView(objects, (), now_ns, 0.0, choices).of(Wanted("car"))
+        found = ObjectsInView(objects, (), now_ns, 0.0, choices).of(Subject("car"))
     return found
 
 

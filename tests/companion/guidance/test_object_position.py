@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.target import RangeSource, Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 
 T0, PERIOD_NS = 10_000_000_000, 100_000_000

@@ -22,8 +22,8 @@ from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.missions.mission_file import MissionError, plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
-from companion.guidance.targets.from_markers import NO_MARKERS, MarkerSight
-from companion.guidance.targets.ranging import RangeMeans
+from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.objects.ranging import RangeMeans
 from companion.vehicle.state import FlightMode, LandedState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, ScriptedGimbal, parked
 from vision.obstacle_sectors import SECTORS, ObstacleSectors

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.guidance.targets import range_error
-from companion.guidance.targets.from_detections import (
+from companion.guidance.objects import range_error
+from companion.guidance.objects.from_detections import (
     CONTACT_INSET_M,
     MIN_DEPRESSION_RAD,
     StateHistory,
     _contact_px,
     targets_from_detections,
 )
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import VehicleState
 from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount

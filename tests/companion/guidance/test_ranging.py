@@ -10,8 +10,8 @@ import pytest
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
+from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.requirements import check_requirements
-from companion.guidance.targets.ranging import ALL_MEANS, RangeMeans, sees_ground
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from companion.guidance.behaviours.search import SearchBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
+from companion.guidance.objects.target import DOUBTED
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
-from companion.guidance.targets.target import DOUBTED
 from tests.companion.guidance.guidance_harness import Flight
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

@@ -18,7 +18,7 @@ from companion.guidance.command import BuildContext
 from companion.guidance.grammar import parse
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.target import Target
 from tests.companion.guidance.gimbal_flight import (
     CAMERA,
     FOOTPRINT,

@@ -9,13 +9,13 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from companion.guidance.targets.from_detections import (
+from companion.guidance.objects.from_detections import (
     CONTACT_INSET_M,
     HistoryError,
     StateHistory,
     targets_from_detections,
 )
-from companion.guidance.targets.target import RangeSource
+from companion.guidance.objects.target import RangeSource
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import euler_from_quaternion, quaternion_from_euler, slerp, wrap_angle
 from vision.camera_model import CameraModel, CameraMount, DistortionModel

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.guidance.targets.from_detections import (
+from companion.guidance.objects.from_detections import (
     HistoryError,
     StateHistory,
     mount_at,
     targets_from_detections,
 )
-from companion.guidance.targets.from_markers import looks_down
-from companion.guidance.targets.target import RangeSource
+from companion.guidance.objects.from_markers import looks_down
+from companion.guidance.objects.target import RangeSource
 from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
 from vision.attitude import quaternion_from_euler

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from benchmarks.rendered import camera_settings
-from companion.guidance.targets.from_detections import StateHistory
-from companion.guidance.targets.from_map import DRIFT_MPS, ESTIMATE_MARGIN_M, VisionGate
-from companion.guidance.targets.from_markers import LocalizedMarkers
+from companion.guidance.objects.from_detections import StateHistory
+from companion.guidance.objects.from_map import DRIFT_MPS, ESTIMATE_MARGIN_M, VisionGate
+from companion.guidance.objects.from_markers import LocalizedMarkers
 from companion.perception.assembly import marker_finder
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.marker_tracker import MarkerTracker

@@ -13,7 +13,7 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import CommandResult, GuidanceInput, GuidanceOutput
-from companion.guidance.targets.from_detections import HistorySamples
+from companion.guidance.objects.from_detections import HistorySamples
 from companion.recording.guidance_record import StepContext
 from companion.recording.link_bytes import unpack_link_bytes
 from companion.recording.tap import MAX_PIECES, MAX_STEPS, FlightTap, run_record

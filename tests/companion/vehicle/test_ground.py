@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from companion.guidance.targets.from_detections import StateHistory
+from companion.guidance.objects.from_detections import StateHistory
 from companion.settings import Settings
 from companion.vehicle.state import HeightSource, VehicleState
 from companion.vehicle.telemetry import apply_message

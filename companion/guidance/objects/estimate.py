@@ -15,7 +15,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.geolocation import position_covariance
 

@@ -14,8 +14,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.from_detections import Pose, StateHistory, mount_at
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3
 from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraModel, CameraMount

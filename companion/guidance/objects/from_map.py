@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.geometry.geodesy import north_east
-from companion.guidance.targets.from_detections import Pose, StateHistory, mount_at
+from companion.guidance.objects.from_detections import Pose, StateHistory, mount_at
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.vision_position import VisionPosition
 from vision.attitude import euler_from_quaternion, wrap_angle

@@ -13,9 +13,9 @@ from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from companion.guidance.objects.from_markers import marker_name
+from companion.guidance.objects.target import DOUBTED, UNCONFIRMED_MARKER, Target
 from companion.guidance.objects.tracked_object import TrackedObject
-from companion.guidance.targets.from_markers import marker_name
-from companion.guidance.targets.target import DOUBTED, UNCONFIRMED_MARKER, Target
 from companion.vehicle.gimbal import GimbalAim
 from vision.attitude import wrap_angle
 
@@ -26,7 +26,7 @@ NEAR_M, NEAR_MPS = 2.0, 1.0
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class Subject:
     """The objects that a command is about: those of a class, one track, or one printed marker."""
 
     class_name: str = ""
@@ -85,7 +85,7 @@ class Wanted:
 
     def same(self, targets: Collection[Target], last: Target, confidence: float = 0.0) -> list[Target]:
         """Those that may be the object that was seen last: of its class, with any id."""
-        return Wanted(last.class_name).of(targets, confidence)
+        return Subject(last.class_name).of(targets, confidence)
 
     @property
     def doubted(self) -> str:
@@ -194,11 +194,11 @@ class GlobalPoint:
 
 
 # Where to point the gimbal: a direction, an object, or a place.
-GimbalGoal = GimbalAim | Wanted | GlobalPoint
+GimbalGoal = GimbalAim | Subject | GlobalPoint
 
 
 def newest_of(
-    wanted: Wanted, seen: Target | None, targets: Collection[Target], tracks: RecentTracks, now_ns: int
+    wanted: Subject, seen: Target | None, targets: Collection[Target], tracks: RecentTracks, now_ns: int
 ) -> Target | None:
     """The newest detection of a track, or of the best object of a class; None: none.
 

@@ -9,7 +9,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from companion.guidance.targets.from_detections import MIN_DEPRESSION_RAD
+from companion.guidance.objects.from_detections import MIN_DEPRESSION_RAD
 from vision.camera_model import CameraModel
 from vision.class_names import fold_name
 

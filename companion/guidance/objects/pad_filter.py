@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from companion.guidance.targets.from_markers import MarkerTarget
+from companion.guidance.objects.from_markers import MarkerTarget
 from companion.vehicle.state import Vector3
 
 # One sigma of a detection: corners and calibration, and one degree of attitude at its distance.

@@ -14,8 +14,8 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.guidance.targets.estimate import UNSTATED_SIGMA
-from companion.guidance.targets.target import Target
+from companion.guidance.objects.estimate import UNSTATED_SIGMA
+from companion.guidance.objects.target import Target
 from companion.vehicle.state import Vector3
 
 # Distances are compared by their medians over this long, because a single one has the noise of a box.

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.targets.range_error import (
+from companion.guidance.objects.range_error import (
     UNSTATED_POSITION_SIGMA_M,
     BoxError,
     PoseError,
@@ -32,7 +32,7 @@ from companion.guidance.targets.range_error import (
     size_distance_sigma_m,
     size_range_sigma_m,
 )
-from companion.guidance.targets.target import RangeSource, Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.gimbal import YawFrame
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import slerp, turned_about_down

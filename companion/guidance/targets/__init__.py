@@ -1,1 +1,0 @@
-"""Targets in local NED: from detections and markers, filtered, selected."""
