@@ -49,18 +49,28 @@ def camera_settings(
 
 
 def rendered_scene(
-    objects: Sequence[SceneObject], camera: CameraModel, mount: CameraMount, seed: int, *, depth: bool = False
+    objects: Sequence[SceneObject],
+    camera: CameraModel,
+    mount: CameraMount,
+    seed: int,
+    *,
+    depth: bool = False,
+    alike: bool = False,
 ) -> tuple[Scene, tuple[SceneObject, ...]]:
     """The objects on a field, and the same with the sizes of those that are drawn, in their order.
 
     Args:
         objects: of classes that can be drawn; one that is hidden is taken away meanwhile.
         depth: the camera is a stereo camera with depth; False: its frames have none.
+        alike: those of one class have one shape and colour.
     """
     rng = np.random.default_rng((seed, 73))
     drawn, sized = [], []
+    appearance = int(rng.integers(2**31))
     for number, item in enumerate(objects):
-        thing = WorldObject(number, item.class_name, (0.0, 0.0, 0.0), appearance=int(rng.integers(2**31)))
+        if number and not alike:
+            appearance = int(rng.integers(2**31))
+        thing = WorldObject(number, item.class_name, (0.0, 0.0, 0.0), appearance=appearance)
         rear, front, left, right = thing.footprint_m
         drawn.append(thing)
         sized.append(replace(item, size_m=(front - rear, right - left, item.size_m[2])))
