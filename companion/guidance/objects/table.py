@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from companion.guidance.objects.estimate import Estimate, Fit
 from companion.guidance.objects.position_filter import PositionFilter
-from companion.guidance.objects.target import Target
+from companion.guidance.objects.target import RangeSource, Target
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -39,6 +40,9 @@ OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 # Two boxes of a frame within this bearing, or that overlap by this IoU, may be of one object: the detector
 # finds some of them twice.
 SAME_BEARING_RAD, ONE_OBJECT_IOU = 0.03, 0.5
+# Where a nearer box covers this share of a box's width at its lower edge, a part of the object is hidden: neither
+# the middle of the box nor its lower edge is the object's. For so long the position is predicted instead.
+HIDDEN_SHARE, HIDDEN_S = 0.2, 2.0
 # Without a tracker a detection within this bearing of an object that is not seen otherwise may be it.
 DIRECTION_RAD = 0.1
 # An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
@@ -214,6 +218,7 @@ class _Frame:
     ) -> None:
         self._table, self._vehicle, self._now_ns = table, vehicle, captured_ns
         self._left = _with_unique_ids(target for target in targets if target.captured_ns == captured_ns)
+        self._hidden = {id(each) for each in self._left if _is_hidden(each, self._left)}
         self._seen: dict[int, Target] = {}  # by object
         self._ways: dict[int, list[Estimate]] = {}
         self._fits: dict[tuple[int, int], tuple[Estimate, Fit]] = {}
@@ -238,15 +243,28 @@ class _Frame:
                 assert known.filter is not None
                 ways = known.filter.at(self._now_ns, unseen=known.was_occluded(self._now_ns))
                 self._ways[known.object_id] = ways
-            fits = [(way, way.fit(target, self._vehicle)) for way in ways]
+            measured = target
+            if self._partly_hidden(known, target):
+                measured = replace(target, position_ned_m=None, range_source=RangeSource.NONE)
+            fits = [(way, way.fit(measured, self._vehicle)._replace(target=target)) for way in ways]
             self._fits[key] = min(fits, key=lambda pair: pair[1].squared)
         return self._fits[key]
+
+    def _partly_hidden(self, known: _Object, target: Target) -> bool:
+        """Whether a detection shows a part of this object, and all of it was seen lately."""
+        if id(target) not in self._hidden or known.filter is None:
+            return False
+        return self._now_ns - known.filter.located_ns <= HIDDEN_S * 1e9
 
     def _owner(self, target: Target) -> _Object | None:
         return None if target.track_id is None else self._table._owners.get(target.track_id)
 
     def _take(self, known: _Object, target: Target) -> None:
         """A detection is of this object."""
+        if self._partly_hidden(known, target):
+            self._own(known, target)
+            self._left = [each for each in self._left if each is not target]
+            return
         if known.filter is not None and not known.filter.begins_again(target):
             expected, fit = self._fit(known, target)
             self._note_occlusion(known, target, fit)
@@ -398,7 +416,8 @@ class _Frame:
         image tracker has not lost it, so the filter is wrong.
         """
         assert known.filter is not None
-        if target.position_ned_m is None or not target.trusted or known.filter.is_part(target):
+        part = known.filter.is_part(target) or self._partly_hidden(known, target)
+        if target.position_ned_m is None or not target.trusted or part:
             known.refused = []
             return
         if any(
@@ -502,6 +521,21 @@ def _with_unique_ids(targets: Iterable[Target]) -> list[Target]:
         elif target.confidence > same[0].confidence:
             same[0] = target
     return [target for same in kept.values() for target in same]
+
+
+def _is_hidden(target: Target, frame: Sequence[Target]) -> bool:
+    """Whether another box of the frame, nearer by its lower edge, hides a part of the object."""
+    left, top, right, bottom = target.box_xyxy
+    for other in frame:
+        left2, top2, right2, bottom2 = other.box_xyxy
+        covered = min(right, right2) - max(left, left2)
+        if (
+            covered > HIDDEN_SHARE * (right - left)
+            and top2 < bottom < bottom2
+            and _overlap(target, other) < ONE_OBJECT_IOU
+        ):
+            return True
+    return False
 
 
 def _overlap(one: Target, other: Target) -> float:
