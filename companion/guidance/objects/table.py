@@ -40,9 +40,9 @@ OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 # Two boxes of a frame within this bearing, or that overlap by this IoU, may be of one object: the detector
 # finds some of them twice.
 SAME_BEARING_RAD, ONE_OBJECT_IOU = 0.03, 0.5
-# Where a nearer box covers this share of a box's width at its lower edge, a part of the object is hidden: neither
-# the middle of the box nor its lower edge is the object's. For so long the position is predicted instead.
-HIDDEN_SHARE, HIDDEN_S = 0.2, 2.0
+# Where a nearer box covers this share of a box's width at its lower edge, a part of the object is hidden: the
+# lower edge is not the object's, and perhaps not the middle. For so long its position is predicted instead.
+HIDDEN_SHARE, HIDDEN_S = 0.5, 2.0
 # Without a tracker a detection within this bearing of an object that is not seen otherwise may be it.
 DIRECTION_RAD = 0.1
 # An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
@@ -524,13 +524,14 @@ def _with_unique_ids(targets: Iterable[Target]) -> list[Target]:
 
 
 def _is_hidden(target: Target, frame: Sequence[Target]) -> bool:
-    """Whether another box of the frame, nearer by its lower edge, hides a part of the object."""
-    left, top, right, bottom = target.box_xyxy
+    """Whether a confirmed object of the frame, nearer by its lower edge, hides a part of the object."""
+    left, _, right, bottom = target.box_xyxy
     for other in frame:
         left2, top2, right2, bottom2 = other.box_xyxy
         covered = min(right, right2) - max(left, left2)
         if (
-            covered > HIDDEN_SHARE * (right - left)
+            other.trusted
+            and covered > HIDDEN_SHARE * (right - left)
             and top2 < bottom < bottom2
             and _overlap(target, other) < ONE_OBJECT_IOU
         ):
