@@ -22,7 +22,7 @@ import zenoh
 
 from companion.bench.percentiles import percentiles
 from companion.bus import topics
-from companion.bus.bodies.frames import DetectionBody, DetectionsBody
+from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus, encode
 from companion.peer_data import copy_payload, parse_object
@@ -321,6 +321,7 @@ def _detections(sequence: int) -> DetectionsBody:
         "track_id": 7,
         "track_score": 0.88,
         "track_state": "confirmed",
+        "object_id": 1,
         "track_age_s": 3.2,
         "bearing_rad": 0.0512,
         "elevation_rad": -0.0213,
@@ -337,6 +338,25 @@ def _detections(sequence: int) -> DetectionsBody:
         "error_ellipse": {"semi_major_m": 0.38, "semi_minor_m": 0.352, "orientation_rad": 1.622},
     }
     now_ns = time.monotonic_ns()
+    seen: ObjectBody = {
+        "object_id": 1,
+        "track_ids": [7],
+        "class_name": "car",
+        "position_ned_m": [11.323124861, 0.581204417, -2.410362913],
+        "latitude_deg": 47.39781404,
+        "longitude_deg": 8.54560773,
+        "altitude_amsl_m": 490.41,
+        "velocity_ned_mps": [0.031442871, -0.012398114],
+        "covariance": [0.023149871203] * 16,
+        "moving": False,
+        "located_ns": now_ns,
+        "first_ns": now_ns,
+        "last_ns": now_ns,
+        "confirmed": True,
+        "ambiguous": False,
+        "doubt": 0.0,
+        "occluded": False,
+    }
     return {
         "vehicle": VEHICLE,
         "camera": None,
@@ -354,4 +374,5 @@ def _detections(sequence: int) -> DetectionsBody:
         "timing_ms": {"preprocess": 1.1, "inference": 21.0, "postprocess": 0.8},
         "dropped": 0,
         "detections": [car] * DETECTIONS,
+        "objects": [seen] * DETECTIONS,
     }

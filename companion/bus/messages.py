@@ -21,6 +21,7 @@ from companion.bus.bodies.frames import (
     ImageBody,
     MarkerBody,
     MarkersBody,
+    ObjectBody,
     PositionBody,
     TrackEventBody,
     TracksBody,
@@ -32,7 +33,6 @@ from companion.bus.topics import NO_OBJECTS
 from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.objects.from_detections import StateHistory, mount_at
 from companion.guidance.objects.from_markers import BoardTarget, BodyPose, LocalizedMarkers, MarkerTarget
-from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.clock_sync import ClockOffset
@@ -55,13 +55,13 @@ class Localization:
         targets: one per detection, in their order; empty if `error` gives the reason.
         error: why the detections have no direction; empty if they have.
         origin: of local NED; None while latitude and longitude are unknown.
-        objects: the camera's; None: unknown.
+        objects: the camera's, as guidance gets them.
     """
 
     targets: tuple[Target, ...] = ()
     error: str = ""
     origin: GeodeticOrigin | None = None
-    objects: ObjectTable | None = None
+    objects: tuple[TrackedObject, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,18 +88,18 @@ def detections_message(
         clock: the autopilot's; the capture is then also given in it, with its error.
         localization: of the steering camera; None for others.
     """
-    detections = result.detections
+    detections, localized = result.detections, localization or Localization()
     records = detections.records()
     # A box where the lens has no rays has no target.
     targets: dict[tuple[str, tuple[float, ...]], Target] = {
-        (target.class_name, target.box_xyxy): target
-        for target in (() if localization is None else localization.targets)
+        (target.class_name, target.box_xyxy): target for target in localized.targets
     }
     ages_s: list[float | None] = [None] * len(records)
     if detections.track_first_ns is not None:
         first_ns = detections.track_first_ns.tolist()
         ages_s = [round((result.captured_ns - first) / 1e9, 3) if first else None for first in first_ns]
-    origin = None if localization is None else localization.origin
+    origin = localized.origin
+    object_ids = {id(each.detection): each.object_id for each in localized.objects if not each.occluded}
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "captured_boot_ns": None if clock is None else result.captured_ns + clock.offset_ns,
@@ -111,14 +111,20 @@ def detections_message(
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
         "detections": [
-            _detection(record, age_s, targets.get((record["class_name"], tuple(record["xyxy"]))), origin)
+            _detection(record, age_s, target, origin, None if target is None else object_ids.get(id(target)))
             for record, age_s in zip(records, ages_s, strict=True)
+            for target in [targets.get((record["class_name"], tuple(record["xyxy"])))]
         ],
+        "objects": [_object(each, origin) for each in localized.objects],
     }
 
 
 def _detection(
-    record: DetectionRecord, age_s: float | None, target: Target | None, origin: GeodeticOrigin | None
+    record: DetectionRecord,
+    age_s: float | None,
+    target: Target | None,
+    origin: GeodeticOrigin | None,
+    object_id: int | None,
 ) -> DetectionBody:
     position = None if target is None else target.position_ned_m
     covariance = None if target is None else target.position_covariance
@@ -136,6 +142,7 @@ def _detection(
         "track_id": record.get("track_id"),
         "track_score": record.get("track_score"),
         "track_state": record.get("track_state"),
+        "object_id": object_id,
         "track_age_s": age_s,
         "bearing_rad": None if target is None else round(target.bearing_rad, 4),
         "elevation_rad": None if target is None else round(target.elevation_rad, 4),
@@ -152,13 +159,45 @@ def _detection(
 def _position_fields(
     position: Vector3 | None, origin: GeodeticOrigin | None, ellipse: ErrorEllipse | None
 ) -> PositionBody:
-    place = None if position is None or origin is None else origin.place(position)
+    latitude_deg, longitude_deg, altitude_amsl_m = _place(position, origin)
     return {
         "position_ned_m": None if position is None else [round(value, 3) for value in position],
-        "latitude_deg": None if place is None else round(place[0], 8),
-        "longitude_deg": None if place is None else round(place[1], 8),
-        "altitude_amsl_m": None if place is None else round(place[2], 3),
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "altitude_amsl_m": altitude_amsl_m,
         "error_ellipse": None if ellipse is None else _ellipse(ellipse),
+    }
+
+
+def _place(
+    position: Vector3 | None, origin: GeodeticOrigin | None
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    if position is None or origin is None:
+        return None, None, None
+    latitude_deg, longitude_deg, altitude_amsl_m = origin.place(position)
+    return round(latitude_deg, 8), round(longitude_deg, 8), round(altitude_amsl_m, 3)
+
+
+def _object(each: TrackedObject, origin: GeodeticOrigin | None) -> ObjectBody:
+    latitude_deg, longitude_deg, altitude_amsl_m = _place(each.position_ned_m, origin)
+    return {
+        "object_id": each.object_id,
+        "track_ids": list(each.track_ids),
+        "class_name": each.class_name,
+        "position_ned_m": None if each.position_ned_m is None else list(each.position_ned_m),
+        "latitude_deg": latitude_deg,
+        "longitude_deg": longitude_deg,
+        "altitude_amsl_m": altitude_amsl_m,
+        "velocity_ned_mps": list(each.velocity_ned_mps),
+        "covariance": [value for row in each.covariance for value in row],
+        "moving": each.moving,
+        "located_ns": each.located_ns,
+        "first_ns": each.first_ns,
+        "last_ns": each.last_ns,
+        "confirmed": each.confirmed,
+        "ambiguous": each.ambiguous,
+        "doubt": each.doubt,
+        "occluded": each.occluded,
     }
 
 
@@ -178,17 +217,17 @@ def tracks_message(
     localization: Localization | None = None,
 ) -> TracksBody:
     """Create the message of one frame's track events; every track in it is or was confirmed."""
-    objects, origin = (None, None) if localization is None else (localization.objects, localization.origin)
+    localized = localization or Localization()
+    of_track = {track_id: each for each in localized.objects for track_id in each.track_ids}
+    seen = [of_track.get(event.track.track_id) for event in result.track_events]
+    named = {each.object_id: each for each in seen if each is not None}
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "events": [
-            _track_event(
-                event,
-                None if objects is None else objects.of_track(event.track.track_id),
-                origin,
-            )
-            for event in result.track_events
+            _track_event(event, each, localized.origin)
+            for event, each in zip(result.track_events, seen, strict=True)
         ],
+        "objects": [_object(each, localized.origin) for each in named.values()],
     }
 
 
@@ -227,6 +266,7 @@ def _track_event(
         "last_ns": track.last_ns,
         **_position_fields(position, origin, ellipse),
         "moving": seen.moving if seen is not None and located else None,
+        "object_id": None if seen is None else seen.object_id,
     }
 
 

@@ -124,8 +124,8 @@ class Bridge:
         self._lock = threading.Lock()
         self._number = 0
         self._cameras: dict[str, _Camera] = {}
-        # Track id → sighting, and when it came; the newest last.
-        self._sightings: dict[int, tuple[Sighting, float]] = {}
+        self._sightings: list[Sighting] = []
+        self._sightings_s = 0.0
         self._state: dict[str, Any] = {}
         self._alive: bool | None = None
         self._subscribed_s = 0.0
@@ -181,10 +181,9 @@ class Bridge:
         return None if kept is None else time.monotonic() - kept.received_s
 
     def sightings(self) -> list[Sighting]:
-        """Return the confirmed tracks of the last `TRACK_SHOWN_S` seconds whose position is known."""
-        oldest_s = time.monotonic() - TRACK_SHOWN_S
+        """Return the confirmed objects with a track and a position of the steering camera's newest frame."""
         with self._lock:
-            return [sighting for sighting, seen_s in self._sightings.values() if seen_s > oldest_s]
+            return [] if time.monotonic() - self._sightings_s > TRACK_SHOWN_S else self._sightings
 
     async def image(self, camera: str, after: int, timeout_s: float) -> CameraImage | None:
         """Wait for an image of another frame than `after`; None if none comes. `camera`: "" is the first."""
@@ -240,22 +239,16 @@ class Bridge:
             if camera is None or not isinstance(value.get("sequence"), int):
                 return
             camera.frames.append(value)
-            self._note_sightings(value)
+            if value.get("localization_error") is not None:  # the steering camera's
+                found = _sightings(self.vehicle, value)
+                with self._lock:
+                    self._sightings, self._sightings_s = found, time.monotonic()
         elif path == VEHICLE.name:
             self._state = value
         text = json.dumps(value)
         with self._lock:
             self._number += 1
             self._topics[path] = _Message(text, self._number, time.monotonic())
-
-    def _note_sightings(self, message: dict[str, Any]) -> None:
-        now_s = time.monotonic()
-        for found in _sightings(self.vehicle, message):
-            with self._lock:
-                self._sightings.pop(found.track_id, None)
-                self._sightings[found.track_id] = found, now_s
-                if len(self._sightings) > MAX_TRACKS:
-                    del self._sightings[next(iter(self._sightings))]
 
     def _keep(self, kept: deque[tuple[int, dict[str, Any]]], value: dict[str, Any]) -> bool:
         """Append a message; False: it is one of those that the service keeps, and was received before."""
@@ -323,29 +316,36 @@ def _boxes(frames: list[dict[str, Any]], sequence: int) -> dict[str, Any]:
 
 
 def _sightings(vehicle: str, message: dict[str, Any]) -> list[Sighting]:
-    """Return the confirmed tracks with a position in a message of detections; none if it is malformed."""
+    """Return the objects of a message of detections, the newest seen; none if it is malformed."""
     try:
+        known = [
+            one
+            for one in message["objects"][:MAX_BOXES]
+            if one["confirmed"] and one["track_ids"] and one["latitude_deg"] is not None
+        ]
+        known.sort(key=lambda one: -int(one["last_ns"]))
         found = [
             Sighting(
                 vehicle,
-                int(one["track_id"]),
+                int(one["track_ids"][-1]),
                 str(one["class_name"]),
                 float(one["latitude_deg"]),
                 float(one["longitude_deg"]),
-                None if one.get("range_sigma_m") is None else float(one["range_sigma_m"]),
+                (float(one["covariance"][0]), float(one["covariance"][1]), float(one["covariance"][5])),
             )
-            for one in message["detections"][:MAX_BOXES]
-            if one.get("track_state") == "confirmed" and one.get("latitude_deg") is not None
+            for one in known[:MAX_TRACKS]
         ]
         return [one for one in found if _is_plausible(one)]
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, IndexError):
         logger.debug("a message with unusable detections", exc_info=True)
         return []
 
 
 def _is_plausible(one: Sighting) -> bool:
     place = abs(one.latitude_deg) < 90.0 and abs(one.longitude_deg) <= 180.0
-    return place and (one.sigma_m is None or 0.0 <= one.sigma_m < MAX_SIGMA_M)
+    north_m2, both_m2, east_m2 = one.covariance_m2
+    error = 0.0 < north_m2 < MAX_SIGMA_M**2 and 0.0 < east_m2 < MAX_SIGMA_M**2
+    return place and error and both_m2**2 < north_m2 * east_m2
 
 
 def _json(sample: zenoh.Sample) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Which tracks of several vehicles are one object."""
+"""Which objects of several vehicles are one."""
 
 from __future__ import annotations
 
@@ -7,28 +7,30 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from companion.geometry.gate import GATE, squared_distance
 from companion.geometry.geodesy import latitude_longitude, north_east
-
-MARGIN_M = 1.0
-"""For the positions of the vehicles themselves."""
-UNKNOWN_SIGMA_M = 1.0
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """A confirmed track of a vehicle. Degrees, WGS 84; `sigma_m`: one sigma of its range, None: unknown."""
+    """A vehicle's confirmed object. Degrees, WGS 84.
+
+    Attributes:
+        track_id: its newest.
+        covariance_m2: of its position: north, north with east, east; the vehicle's own error included.
+    """
 
     vehicle: str
     track_id: int
     class_name: str
     latitude_deg: float
     longitude_deg: float
-    sigma_m: float | None = None
+    covariance_m2: tuple[float, float, float]
 
     @property
     def variance_m2(self) -> float:
-        """Square of the range error."""
-        return (UNKNOWN_SIGMA_M if self.sigma_m is None else max(self.sigma_m, 0.01)) ** 2
+        """Mean of the two axes."""
+        return (self.covariance_m2[0] + self.covariance_m2[2]) / 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +46,9 @@ class SeenObject:
 def merged(sightings: Iterable[Sighting]) -> list[SeenObject]:
     """Return the objects that the vehicles see.
 
-    Two tracks of different vehicles are one object if their classes are equal and they are at most two sigma
-    of both range errors together plus `MARGIN_M` apart. The nearest are joined first. Tracks of one vehicle
-    are different objects, so an object has at most one track of each vehicle, and all its tracks are within
-    that distance of each other.
+    Those of different vehicles are one if their classes are equal and their distance is inside the gate of a
+    vehicle's own objects, with both covariances. The best fits are joined first. Objects of one vehicle are
+    different ones, so each has at most one of each vehicle, and all of these are inside the gate.
     """
     of_class: dict[str, list[Sighting]] = defaultdict(list)
     for sighting in sightings:
@@ -72,15 +73,15 @@ def _groups(placed: list[_Placed]) -> list[list[_Placed]]:
     # Vehicle → its sighting.
     group_of = {index: {one[2].vehicle: one} for index, one in enumerate(placed)}
     pairs = sorted(
-        (math.dist(one[:2], other[:2]), first, second)
+        (squared, first, second)
         for first, one in enumerate(placed)
         for second, other in enumerate(placed[:first])
-        if _one_object(one, other)
+        if (squared := _squared(one, other)) <= GATE
     )
     for _, first, second in pairs:
         group, joining = group_of[first], group_of[second]
         if group.keys().isdisjoint(joining) and all(
-            _one_object(one, other) for one in group.values() for other in joining.values()
+            _squared(one, other) <= GATE for one in group.values() for other in joining.values()
         ):
             group |= joining
             for index, joined in group_of.items():
@@ -89,9 +90,12 @@ def _groups(placed: list[_Placed]) -> list[list[_Placed]]:
     return [list(group.values()) for group in {id(group): group for group in group_of.values()}.values()]
 
 
-def _one_object(one: _Placed, other: _Placed) -> bool:
-    reach_m = 2.0 * math.sqrt(one[2].variance_m2 + other[2].variance_m2) + MARGIN_M
-    return one[2].vehicle != other[2].vehicle and math.dist(one[:2], other[:2]) <= reach_m
+def _squared(one: _Placed, other: _Placed) -> float:
+    """Squared Mahalanobis distance; infinite between those of one vehicle."""
+    if one[2].vehicle == other[2].vehicle:
+        return math.inf
+    (nn, ne, ee), (nn2, ne2, ee2) = one[2].covariance_m2, other[2].covariance_m2
+    return squared_distance(one[0] - other[0], one[1] - other[1], (nn + nn2, ne + ne2, ee + ee2))
 
 
 def _object(class_name: str, origin_deg: tuple[float, float], group: list[_Placed]) -> SeenObject:

@@ -14,8 +14,9 @@ from typing import Any, TypeVar
 import zenoh
 
 from companion.bus import topics
-from companion.bus.bodies.frames import DetectionBody, DetectionsBody
+from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.bodies.service import CommandStateBody, EventBody, StatusBody, StatusCameraBody
+from companion.bus.bodies.vehicle import VehicleBody
 from companion.bus.client import image_of
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
@@ -82,12 +83,13 @@ class LiveVehicle:
         """The objects of the newest frame with an image, and the vehicle's pose."""
         seen = await self._detections()
         fault = None if seen else await self._camera_fault()
-        detections, colours = seen or ([], [])
+        frame, colours = seen or (None, [])
         vehicle = await _next(self._drone.vehicle(), _STATE_S)
         yaw_rad = None if vehicle is None else vehicle["yaw_rad"]
+        known = {} if frame is None else {each["object_id"]: each for each in frame["objects"]}
         objects = tuple(
-            replace(_object(each, yaw_rad), colour=colour)
-            for each, colour in zip(detections, colours, strict=True)
+            replace(_object(each, known.get(each["object_id"] or 0), vehicle), colour=colour)
+            for each, colour in zip([] if frame is None else frame["detections"], colours, strict=True)
         )
         height_m = None if vehicle is None else vehicle["altitude_m"]
         return Scene(self._class_names, objects, yaw_rad, height_m, fault=fault)
@@ -166,15 +168,15 @@ class LiveVehicle:
             facts.append(camera["problem"])
         return f"no detections received: {'; '.join(facts)}"
 
-    async def _detections(self) -> tuple[list[DetectionBody], list[str | None]] | None:
-        """The detections of a frame and their colours by its image; without an image, None for each.
+    async def _detections(self) -> tuple[DetectionsBody, list[str | None]] | None:
+        """A frame and the colours of its detections by its image; without an image, None for each.
 
         None: no frame came that a detector has seen.
         """
         frames = self._drone.detections(self._camera, size=_FRAMES)
         received: dict[int, DetectionsBody] = {}
         jpegs: dict[int, bytes] = {}
-        newest: list[DetectionBody] | None = None
+        newest: DetectionsBody | None = None
         subscriber = self._images(jpegs)
         try:
             async with asyncio.timeout(_STATE_S):
@@ -182,19 +184,19 @@ class LiveVehicle:
                     if frame["model"] is None:  # frames are read without a detector
                         return None
                     received[frame["sequence"]] = frame
-                    newest = frame["detections"]
-                    if not newest:
-                        return [], []
+                    newest = frame
+                    if not frame["detections"]:
+                        return frame, []
                     if common := received.keys() & jpegs.keys():
                         both = received[max(common)]
                         colours = await asyncio.to_thread(_colours, jpegs[max(common)], both)
-                        return both["detections"], colours
+                        return both, colours
         except TimeoutError:
             pass
         finally:
             frames.close()
             subscriber.undeclare()  # type: ignore[no-untyped-call]
-        return None if newest is None else (newest, [None] * len(newest))
+        return None if newest is None else (newest, [None] * len(newest["detections"]))
 
     def _images(self, jpegs: dict[int, bytes]) -> zenoh.Subscriber[None]:
         """Collect preview images by the number of their frame."""
@@ -221,15 +223,19 @@ async def _next(stream: Stream[T], timeout_s: float) -> T | None:
         stream.close()
 
 
-def _object(detection: DetectionBody, yaw_rad: float | None) -> SceneObject:
-    bearing_rad = detection["bearing_rad"]
+def _object(detection: DetectionBody, seen: ObjectBody | None, vehicle: VehicleBody | None) -> SceneObject:
+    bearing_rad, range_m = detection["bearing_rad"], detection["ground_range_m"]
+    yaw_rad, own = (None, None) if vehicle is None else (vehicle["yaw_rad"], vehicle["position_ned_m"])
+    if seen is not None and (position := seen["position_ned_m"]) is not None and own is not None:
+        north_m, east_m = position[0] - own[0], position[1] - own[1]
+        bearing_rad, range_m = math.atan2(east_m, north_m), math.hypot(north_m, east_m)
     nose_deg = None
     if bearing_rad is not None and yaw_rad is not None:
         nose_deg = round(math.degrees(math.remainder(bearing_rad - yaw_rad, math.tau)), 1)
     return SceneObject(
         detection["class_name"],
         detection["track_id"],
-        range_m=_rounded(detection["ground_range_m"]),
+        range_m=_rounded(range_m),
         bearing_deg=nose_deg,
     )
 

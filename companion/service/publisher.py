@@ -36,7 +36,7 @@ from companion.bus.vehicle_messages import (
 from companion.guidance.core import Guidance
 from companion.guidance.objects.from_detections import HistoryError
 from companion.guidance.objects.from_markers import LocalizedMarkers
-from companion.perception.cameras import WorkerCamera
+from companion.perception.cameras import PerceptionCamera, WorkerCamera
 from companion.perception.messages import AnyPreview, CloudPreview, DepthPreview
 from companion.perception.supervisor import PerceptionState
 from companion.service.inputs import InputAssembler
@@ -48,6 +48,14 @@ from vision.pipeline import PerceptionResult
 _LOOK_S = 0.1
 
 logger = logging.getLogger(__package__)
+
+
+def localization_of(camera: PerceptionCamera) -> Localization:
+    """Return what guidance gets of a camera's result, to publish it."""
+    objects = camera.objects.objects
+    if camera.repeats:  # the targets are those of an earlier result
+        return Localization(error="no new image", objects=objects)
+    return Localization(camera.targets, camera.localization_error, objects=objects)
 
 
 class Publisher:

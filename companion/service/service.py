@@ -31,7 +31,7 @@ from companion.service.health import Health
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.parts import Parts
-from companion.service.publisher import Publisher
+from companion.service.publisher import Publisher, localization_of
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
@@ -238,10 +238,7 @@ class Service:
             markers = self.inputs.on_result(camera, result)
             if markers is not None and markers.vision is not None:
                 self.driver.send_vision_position(markers.vision)
-            if camera.repeats:  # the targets are those of an earlier result
-                localization = Localization(error="no new image")
-            else:
-                localization = Localization(camera.targets, camera.localization_error, objects=camera.objects)
+            localization = localization_of(camera)
             if camera is self.inputs.steering or markers is not None:
                 self._loop.on_perception()
         finally:

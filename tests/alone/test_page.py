@@ -817,7 +817,9 @@ def test_chat_shows_a_plan_and_flies_what_is_confirmed(window: Tab) -> None:
         def until(expression: str) -> None:
             def shown() -> bool:
                 number = next(sequence)
-                service.publish(VEHICLE.key(NAME), {"yaw_rad": 0.0, "altitude_m": 5.0})
+                service.publish(
+                    VEHICLE.key(NAME), {"yaw_rad": 0.0, "altitude_m": 5.0, "position_ned_m": None}
+                )
                 service.publish(DETECTIONS.key(NAME), frame(number, detections=[found]))
                 service.image(number, jpeg)
                 return bool(tab.value(expression))

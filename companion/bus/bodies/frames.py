@@ -13,6 +13,7 @@ TrackWord = Annotated[str, one_of("confirmed", "tentative", "none")]
 TrackEventWord = Annotated[str, one_of("new", "update", "lost", "end")]
 RangeWord = Annotated[str, one_of("depth", "ground_plane", "known_height", "marker", "none")]
 Matrix3 = Annotated[list[float], Field(min_length=9, max_length=9)]
+Matrix4 = Annotated[list[float], Field(min_length=16, max_length=16)]
 Matrix34 = Annotated[list[float], Field(min_length=12, max_length=12)]
 Covariance = Annotated[list[float], Field(min_length=21, max_length=21)]
 
@@ -62,6 +63,45 @@ class FrameBody(TypedDict):
     """height of the frame, pixels"""
 
 
+class ObjectBody(TypedDict):
+    """One object as guidance has it at this frame, its numbers not rounded; null where unknown."""
+
+    object_id: int
+    """constant while the image tracker changes its ids; of one camera, begins anew when its images do"""
+    track_ids: list[int]
+    """the track ids that it had, the newest last; empty without a tracker"""
+    class_name: str
+    """name of the class"""
+    position_ned_m: Three | None
+    """local NED, at last_ns; of a standing object fused over its detections; null: no range yet"""
+    latitude_deg: float | None
+    """WGS 84"""
+    longitude_deg: float | None
+    """WGS 84"""
+    altitude_amsl_m: float | None
+    """above mean sea level"""
+    velocity_ned_mps: Two
+    """north, east"""
+    covariance: Matrix4
+    """row by row, of north, east (m) and their velocities (m/s), with the vehicle's own position error"""
+    moving: bool
+    """its speed is more than the error explains; its position is the newest, not fused"""
+    located_ns: int
+    """capture of the newest frame that showed all of it with a range; 0: none"""
+    first_ns: int
+    """capture of the first frame with it"""
+    last_ns: int
+    """capture of the newest frame with it"""
+    confirmed: bool
+    """it may be the goal of a command"""
+    ambiguous: bool
+    """its newest detection may be of another class or of another object"""
+    doubt: float
+    """share of its detections since its confirmation in which it was ambiguous, 0 to 1"""
+    occluded: bool
+    """it is not in this frame"""
+
+
 class DetectionBody(PositionBody):
     """One detection. Its position and the fields from `bearing_rad` on are null where unknown, and for other
     cameras than the steering one.
@@ -87,6 +127,8 @@ class DetectionBody(PositionBody):
     """median confidence of the track's newest 100 detections"""
     track_state: TrackWord | None
     """null if tracker.enabled is false"""
+    object_id: int | None
+    """the object of `objects` that it was associated with; null: none"""
     track_age_s: float | None
     """time from the track's first detection to this frame; null without a track"""
     bearing_rad: float | None
@@ -129,6 +171,8 @@ class DetectionsBody(FrameBody):
     """frames lost so far unintentionally"""
     detections: list[DetectionBody]
     """the detections"""
+    objects: list[ObjectBody]
+    """of the frame, and the confirmed ones of the last 10 s; empty for another than the steering camera"""
 
 
 class TrackEventBody(PositionBody):
@@ -162,6 +206,8 @@ class TrackEventBody(PositionBody):
     """capture of the newest of these frames"""
     moving: bool | None
     """the object moves; the position is the newest, not fused over the track"""
+    object_id: int | None
+    """the object of `objects` that it is of; null: none"""
 
 
 class TracksBody(FrameBody):
@@ -169,6 +215,8 @@ class TracksBody(FrameBody):
 
     events: list[TrackEventBody]
     """oldest first"""
+    objects: list[ObjectBody]
+    """those of the events"""
 
 
 class MarkerBody(TypedDict):

@@ -103,12 +103,12 @@ function onDetections(path, message) {
   const name = cameraOf(path);
   camera(name);
   const now = performance.now();
-  for (const found of message.detections || []) {
-    const at = found.position_ned_m || placed(found);
-    if (found.track_id == null || found.track_state === "tentative" || !at) continue;
-    const { trail } = state.tracks.get(found.track_id) || { trail: [] };
+  for (const { confirmed, position_ned_m: at, track_ids: ids, class_name } of message.objects || []) {
+    if (!confirmed || !at || !ids.length) continue;
+    const { trail } = state.tracks.get(ids.find((id) => state.tracks.has(id))) || { trail: [] };
     extend(trail, at, TRACK_TRAIL_POINTS);
-    state.tracks.set(found.track_id, { at, trail, name: found.class_name, seen: now });
+    for (const id of ids) state.tracks.delete(id); // the image tracker has changed it
+    state.tracks.set(ids.at(-1), { at, trail, name: class_name, seen: now });
   }
   for (const [id, track] of state.tracks) {
     if (now - track.seen > TRACK_SHOWN_MS) state.tracks.delete(id);
@@ -121,13 +121,6 @@ function onDetections(path, message) {
 // The name of the camera of a path such as `cameras/down/detections`.
 export function cameraOf(path) {
   return path === "detections" ? "" : path.split("/")[1];
-}
-
-// The position from the direction and the range over ground, where the message has them but no position.
-function placed({ ground_range_m: range, bearing_rad: bearing }) {
-  const own = state.topics.vehicle && state.topics.vehicle.position_ned_m;
-  if (!own || range == null || bearing == null) return null;
-  return [own[0] + range * Math.cos(bearing), own[1] + range * Math.sin(bearing)];
 }
 
 function onStatus(status) {

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.geometry.gate import GATE
 from companion.guidance.objects.estimate import Estimate, Fit
 from companion.guidance.objects.position_filter import PositionFilter
 from companion.guidance.objects.target import RangeSource, Target
@@ -29,9 +30,8 @@ REACH_M, REACH_MPS, LONGEST_S = 1.5, 1.0, 10.0
 # these squared distances fits count as equal (in general; after an occlusion).
 CLEARLY_NEARER = 3.0
 AS_GOOD, AS_GOOD_AGAIN = 0.3, 0.1
-# χ² with two degrees of freedom: 99 % of the object's own detections are inside the first; the image
-# tracker's id is trusted within the second, 90 %, because ids switch where two cars pass each other.
-GATE, SURE_GATE = 9.2, 4.6
+# The image tracker's id is trusted within 90 %, because ids switch where two cars pass each other.
+SURE_GATE = 4.6
 # Unseen for this long, and at least so many frames, the image tracker's id may have switched.
 IDENTITY_S, IDENTITY_FRAMES = 0.5, 4
 # Occlusion: unseen for longer than this, then off the expected position or with another id. The association

@@ -231,7 +231,7 @@ def test_track_events_have_the_fused_position() -> None:
         replace(two_cars(), track_events=events),
         "v",
         NOW_NS,
-        localization=Localization((target,), "", origin, objects),
+        localization=Localization((target,), "", origin, objects.objects),
     )
     check_message("tracks", message)
     ours, other = message["events"]

@@ -75,6 +75,7 @@ def test_detection_message() -> None:
                 "track_id": None,
                 "track_score": None,
                 "track_state": None,
+                "object_id": None,
                 "track_age_s": None,
                 "bearing_rad": None,
                 "elevation_rad": None,
@@ -91,6 +92,7 @@ def test_detection_message() -> None:
                 "error_ellipse": None,
             }
         ],
+        "objects": [],
     }
 
 
@@ -151,8 +153,10 @@ def test_tracks_message() -> None:
                 "altitude_amsl_m": None,
                 "error_ellipse": None,
                 "moving": None,
+                "object_id": None,
             }
         ],
+        "objects": [],
     }
 
 

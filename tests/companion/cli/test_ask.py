@@ -44,7 +44,8 @@ class Service:
         self.ready = True
         self.frame: dict[str, Any] | None = {"model": "yolov8n"}  # None: the camera is dead
         self.perception = {"state": "running", "model": "yolov8n", "problem": ""}
-        self.vehicle = {"yaw_rad": 1.5, "altitude_m": 5.0, "mode": "hold", "armed": True}
+        self.vehicle: dict[str, Any] = {"yaw_rad": 1.5, "altitude_m": 5.0, "mode": "hold", "armed": True}
+        self.vehicle["position_ned_m"] = [1.0, 2.0, -5.0]
         self.flying, self.stopped = asyncio.Event(), asyncio.Event()
         self.bus = Bus(
             ZenohSection(listen=(self.endpoint,)),
@@ -75,11 +76,13 @@ class Service:
         image[15:55, 5:65], image[15:55, 85:145] = (30, 25, 200), (200, 80, 30)
         jpeg = cv2.imencode(".jpg", image)[1].tobytes()
         for sequence in range(10_000):
-            common = {"class_name": "car", "bearing_rad": 1.6, "ground_range_m": 9.0}
+            common = {"class_name": "car", "object_id": 1, "bearing_rad": 1.4, "ground_range_m": 11.0}
             objects = [{**common, "track_id": track, "xyxy": box} for track, box in BOXES.items()]
+            # Not where this frame's detection is: 9 m away at 1.6 rad.
+            there = {"object_id": 1, "position_ned_m": [0.737, 10.996, 0.0]}
             if self.frame is not None:
-                frame = {"sequence": sequence, "width": 320, "height": 240, "detections": objects}
-                self.bus.publish(topics.DETECTIONS, frame | self.frame)
+                frame = {"sequence": sequence, "width": 320, "height": 240, "objects": [there]}
+                self.bus.publish(topics.DETECTIONS, frame | {"detections": objects} | self.frame)
             self.bus.publish(topics.STATUS, {"perception": self.perception})
             self.bus.publish(topics.VEHICLE, self.vehicle)
             self.bus.publish_large(

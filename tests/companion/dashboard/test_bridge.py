@@ -38,6 +38,7 @@ FOUND = {
     "xyxy": [64.0, 48.0, 320.0, 240.0],
     "track_id": 7,
     "track_state": "confirmed",
+    "object_id": None,
 }
 BOX = [0.1, 0.1, 0.5, 0.5, "car", 0.9, 7, "confirmed"]
 
@@ -49,6 +50,7 @@ def frame(sequence: int, **more: Any) -> dict[str, Any]:
         "height": 480,
         "model": "default",
         "detections": [FOUND],
+        "objects": [],
         **more,
     }
 

@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 import zenoh
 
 from companion.bus.topics import DETECTIONS, SETPOINT, VEHICLE, command_key
+from companion.dashboard.bridge import Bridge, Link
 from companion.dashboard.fleet import MAX_VEHICLES
 from companion.geometry.geodesy import latitude_longitude
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
-from tests.companion.dashboard.test_bridge import FOUND, NAME, Publisher, bridging, frame, publishing, until
+from tests.companion.dashboard.test_bridge import NAME, Publisher, bridging, frame, publishing, until
 
 pytestmark = pytest.mark.realtime
 
@@ -46,25 +49,42 @@ def state_at(vehicle: str, north_m: float, east_m: float) -> dict[str, Any]:
     }
 
 
-def detections(track: int, north_m: float, east_m: float, **more: Any) -> dict[str, Any]:
-    """A message with one track at metres from `HOME`."""
+def seen(track: int, north_m: float, east_m: float, **more: Any) -> dict[str, Any]:
+    """An object at metres from `HOME`."""
     latitude, longitude = latitude_longitude(HOME, north_m, east_m)
-    place = {"latitude_deg": latitude, "longitude_deg": longitude, "range_sigma_m": 0.3}
-    return frame(1, detections=[{**FOUND, "track_id": track, **place, **more}])
+    variance_m2 = 0.09
+    return {
+        "track_ids": [1, track],
+        "class_name": "car",
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "covariance": [variance_m2, 0.0, 0.0, 0.0, 0.0, variance_m2],
+        "confirmed": True,
+        "last_ns": 5,
+        **more,
+    }
+
+
+def detections(*objects: dict[str, Any]) -> dict[str, Any]:
+    return frame(1, objects=list(objects), localization_error="")
 
 
 def publish_scene(services: dict[str, Publisher]) -> None:
     """Both see a car 10 m north of `HOME`; the second one also a person."""
     services[NAME].publish(VEHICLE.key(NAME), state_at(NAME, 1.0, 0.0))
-    services[NAME].publish(DETECTIONS.key(NAME), detections(7, 10.0, 0.0))
+    services[NAME].publish(DETECTIONS.key(NAME), detections(seen(7, 10.0, 0.0)))
     services[OTHER].publish(VEHICLE.key(OTHER), state_at(OTHER, 2.0, 1.0))
-    services[OTHER].publish(DETECTIONS.key(OTHER), detections(3, 10.5, 0.2))
-    services[OTHER].publish(DETECTIONS.key(OTHER), detections(4, 0.0, 8.0, class_name="person"))
-    weak = detections(5, 0.0, 20.0, track_state="tentative")
-    services[OTHER].publish(DETECTIONS.key(OTHER), weak)
-    for name in ("latitude_deg", "range_sigma_m", "track_id"):
-        useless = json.dumps(detections(6, 0.0, 30.0, **{name: "number"}))
-        services[OTHER].publish(DETECTIONS.key(OTHER), useless.replace('"number"', "1e999"))
+    car, person = seen(3, 10.5, 0.2), seen(4, 0.0, 8.0, class_name="person")
+    weak = seen(5, 0.0, 20.0, confirmed=False)
+    unknown = [
+        seen(6, 0.0, 30.0, track_ids=[]),
+        seen(6, 0.0, 30.0, latitude_deg=None),
+        seen(6, 0.0, 30.0, covariance=[-1.0] * 6),
+        seen(6, 0.0, 30.0, covariance=[0.1] * 6),
+    ]
+    services[OTHER].publish(DETECTIONS.key(OTHER), detections(car, person, weak, *unknown))
+    other = frame(1, objects=[], localization_error=None)
+    services[OTHER].publish(DETECTIONS.key(OTHER, "down"), other)
 
 
 async def test_page_of_either_vehicle_has_both_and_each_object_once() -> None:
@@ -92,6 +112,17 @@ async def test_page_of_either_vehicle_has_both_and_each_object_once() -> None:
                     assert car["at_ned_m"] == pytest.approx([10.25, east_m + 0.1], abs=0.02)
                     assert person["tracks"] == [[OTHER, 4]]
                     assert person["at_ned_m"] == pytest.approx([0.0, east_m + 8.0], abs=0.02)
+
+
+@pytest.mark.parametrize("field", ["latitude_deg", "covariance", "track_ids", "last_ns"])
+async def test_objects_that_are_no_numbers_are_none(field: str) -> None:
+    text = json.dumps(detections(seen(6, 0.0, 30.0, **{field: "number"})))
+    bridge = Bridge(Link(), OTHER)
+    for number in ("1e999", "-1e999", '"x"', "null", "[]", "{}"):
+        sample = SimpleNamespace(key_expr=DETECTIONS.key(OTHER), payload=text.replace('"number"', number))
+        with patch("companion.dashboard.bridge._json", lambda sample: json.loads(sample.payload)):
+            bridge._on_state(sample)  # type: ignore[arg-type]
+        assert bridge.sightings() == [], number
 
 
 async def test_vehicle_that_comes_later_is_listed_until_it_goes() -> None:

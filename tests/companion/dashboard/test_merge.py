@@ -15,10 +15,12 @@ def seen(
     track: int,
     north_m: float,
     east_m: float = 0.0,
-    sigma_m: float | None = 0.5,
+    sigma_m: float = 0.5,
     name: str = "car",
+    east_sigma_m: float | None = None,
 ) -> Sighting:
-    return Sighting(vehicle, track, name, *latitude_longitude(HOME, north_m, east_m), sigma_m)
+    variances = sigma_m**2, 0.0, (sigma_m if east_sigma_m is None else east_sigma_m) ** 2
+    return Sighting(vehicle, track, name, *latitude_longitude(HOME, north_m, east_m), variances)
 
 
 def groups(*sightings: Sighting) -> list[list[tuple[str, int]]]:
@@ -26,11 +28,16 @@ def groups(*sightings: Sighting) -> list[list[tuple[str, int]]]:
 
 
 def test_near_tracks_of_two_vehicles_are_one_object() -> None:
-    # 2 sigma of both errors together and the margin: 2 * sqrt(0.5) + 1 = 2.41 m
-    assert groups(seen("a", 1, 0.0), seen("b", 5, 2.4)) == [[("a", 1), ("b", 5)]]
-    assert groups(seen("a", 1, 0.0), seen("b", 5, 2.43)) == [[("a", 1)], [("b", 5)]]
+    # The gate is 99 %: sqrt(9.2) sigma of both errors together, 3.03 * sqrt(0.5) = 2.14 m
+    assert groups(seen("a", 1, 0.0), seen("b", 5, 2.13)) == [[("a", 1), ("b", 5)]]
+    assert groups(seen("a", 1, 0.0), seen("b", 5, 2.16)) == [[("a", 1)], [("b", 5)]]
     assert groups(seen("a", 1, 0.0), seen("b", 5, 5.0, sigma_m=2.0)) == [[("a", 1), ("b", 5)]]
-    assert groups(seen("a", 1, 0.0, sigma_m=None), seen("b", 5, 3.2)) == [[("a", 1), ("b", 5)]]
+
+
+def test_gate_has_the_shape_of_the_errors() -> None:
+    long = {"sigma_m": 3.0, "east_sigma_m": 0.3}
+    assert len(groups(seen("a", 1, 0.0), seen("b", 5, 8.0, 0.0, **long))) == 1
+    assert len(groups(seen("a", 1, 0.0), seen("b", 5, 0.0, 8.0, **long))) == 2
 
 
 def test_other_class_or_same_vehicle_is_another_object() -> None:
@@ -45,7 +52,7 @@ def test_nearest_tracks_are_joined_first() -> None:
 
 def test_three_vehicles_join_only_if_all_are_near() -> None:
     assert groups(seen("a", 1, 0.0), seen("b", 2, 1.0), seen("c", 3, 2.0)) == [[("a", 1), ("b", 2), ("c", 3)]]
-    chain = groups(seen("a", 1, 0.0), seen("b", 2, 2.0), seen("c", 3, 4.1))
+    chain = groups(seen("a", 1, 0.0), seen("b", 2, 2.0), seen("c", 3, 4.2))
     assert chain == [[("a", 1), ("b", 2)], [("c", 3)]]
 
 
