@@ -331,7 +331,9 @@ class Fleet:
 
     def _publish(self, member: Member) -> None:
         flight = member.flight
-        pose = flight.inputs.poses.pose(flight.state, member.behaviour, flight.now_ns)
+        pose = flight.inputs.poses.pose(
+            flight.state, member.behaviour, flight.now_ns, in_command=flight.guidance.in_command
+        )
         if pose is None or member.muted:
             return
         message: Any = pose

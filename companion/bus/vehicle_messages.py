@@ -120,6 +120,8 @@ def pose_message(pose: Pose) -> PoseBody:
         "role": pose.role,
         "airborne": pose.airborne,
         "formation": None if pose.formation is None else _formation(pose.formation),
+        "in_command": pose.in_command,
+        "mode": pose.mode,
     }
 
 

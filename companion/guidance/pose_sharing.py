@@ -59,13 +59,27 @@ class PoseSharing:
         """The other vehicles now."""
         return self._neighbours.neighbourhood(state, now_ns)
 
-    def pose(self, state: VehicleState, active: Behaviour | None, now_ns: int) -> Pose | None:
-        """The pose to publish; None while the global position is unknown. `active`: the active behaviour."""
+    def pose(
+        self, state: VehicleState, active: Behaviour | None, now_ns: int, *, in_command: bool
+    ) -> Pose | None:
+        """The pose to publish; None while the global position is unknown.
+
+        Args:
+            active: the active behaviour. in_command: whether guidance is in command of the vehicle.
+        """
         note = active.note if isinstance(active, FormationBehaviour) else None
         role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
             role = "leader"
-        return pose_of(state, now_ns, vehicle=self.vehicle, source=self.source, role=role, formation=note)
+        return pose_of(
+            state,
+            now_ns,
+            vehicle=self.vehicle,
+            source=self.source,
+            role=role,
+            formation=note,
+            in_command=in_command,
+        )
 
     def ages_s(self, now_ns: int) -> dict[str, float]:
         """Age of each other vehicle's pose, seconds."""

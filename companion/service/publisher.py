@@ -224,7 +224,8 @@ class Publisher:
         bus, state = self._bus, self._driver.state
         bus.publish(topics.VEHICLE, lambda: vehicle_message(state, now_ns))
         # By the clock that counts a suspend: until guidance's next step the state may be from before it.
-        pose = self._inputs.poses.pose(state, guidance.active, self._driver.watch.now_ns())
+        clock_ns = self._driver.watch.now_ns()
+        pose = self._inputs.poses.pose(state, guidance.active, clock_ns, in_command=guidance.in_command)
         if pose is not None:
             bus.publish(topics.POSE, lambda: pose_message(pose))
         if guidance.in_command:

@@ -204,6 +204,10 @@ class PoseBody(TypedDict):
     """armed and not on the ground"""
     formation: FormationBody | None
     """its formation, if any"""
+    in_command: NotRequired[bool | None]
+    """its service is in command of it; null: not known"""
+    mode: NotRequired[str]
+    """of its autopilot"""
 
 
 class VelocityBody(TypedDict):

@@ -168,6 +168,7 @@ class FormationBehaviour(Behaviour):
         self._hold_point: Vector3 | None = None
         self._arrived_since_ns: int | None = None
         self._over_since_ns: int | None = None
+        self._led: bool | None = None
         self._words = "waiting for the others"
         self._side = 1.0
         self.note: FormationNote | None = None
@@ -220,9 +221,24 @@ class FormationBehaviour(Behaviour):
             return Outcome(False, f"{leader.name} follows {hood.own}: vehicles cannot follow each other")
         if not (leader.airborne or leader.virtual):
             return Outcome(False, f"the leader {leader.name} is on the ground")
+        self._note_command(leader)
         return _Leader(
             leader.position_ned_m, leader.velocity_ned_mps, leader.heading_rad, leader.turn_rate_radps
         )
+
+    def _note_command(self, leader: Neighbour) -> None:
+        """Note that the leader's pilot or a failsafe has taken it from its service, and the end of that."""
+        if leader.in_command is None or leader.in_command is self._led:
+            return
+        if not leader.in_command:
+            still = "" if self._led is None else " any more"
+            self.add_notes(
+                f"the leader {leader.name} is not flown by its service{still}, but by its pilot or autopilot "
+                f"in mode {leader.mode}; it is followed there"
+            )
+        elif self._led is False:
+            self.add_notes(f"the leader {leader.name} is flown by its service again")
+        self._led = leader.in_command
 
     def _virtual_leader(
         self, dt_s: float, context: BehaviourContext, hood: Neighbourhood, structure: VirtualStructure
@@ -425,7 +441,8 @@ class FormationBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
-        return f"formation, {self._words}"
+        taken = f", {self.leader_name} is not flown by its service" if self._led is False else ""
+        return f"formation, {self._words}{taken}"
 
 
 def _in_frame(position: Vector3, leader: _Leader, heading_rad: float) -> Vector3:

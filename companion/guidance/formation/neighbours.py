@@ -30,7 +30,7 @@ class Neighbour:
         position_ned_m: predicted by its velocity to now, at most `SILENT_S` ahead.
         velocity_ned_mps: as published; zero for a silent vehicle.
         heading_rad, turn_rate_radps: the heading is predicted too.
-        age_s: of the pose. role, airborne, formation: as published.
+        age_s: of the pose. role, airborne, formation, in_command, mode: as published.
         virtual: not a real vehicle; no separation is kept to it.
     """
 
@@ -43,6 +43,8 @@ class Neighbour:
     role: str = "alone"
     airborne: bool = True
     formation: FormationNote | None = None
+    in_command: bool | None = None
+    mode: str = "unknown"
 
     @property
     def silent(self) -> bool:
@@ -227,4 +229,6 @@ def _predicted(name: str, received: _Received, anchor: Anchor, age_s: float) -> 
         pose.role,
         pose.airborne,
         pose.formation,
+        pose.in_command,
+        pose.mode,
     )

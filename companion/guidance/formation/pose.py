@@ -91,6 +91,8 @@ class Pose:
         turn_rate_radps: of the heading, clockwise.
         role: alone, leader, follower or virtual (not a real vehicle).
         airborne: armed and not on the ground.
+        in_command: its service is in command of it; None: not published, as by a virtual leader.
+        mode: of its autopilot, a `FlightMode`.
     """
 
     vehicle: str
@@ -106,6 +108,8 @@ class Pose:
     role: str = "alone"
     airborne: bool = True
     formation: FormationNote | None = None
+    in_command: bool | None = None
+    mode: str = "unknown"
 
 
 def global_problem(state: VehicleState, now_ns: int) -> str | None:
@@ -126,6 +130,7 @@ def pose_of(
     source: str,
     role: str = "alone",
     formation: FormationNote | None = None,
+    in_command: bool | None = None,
 ) -> Pose | None:
     """The pose of a vehicle now; None while its global position is unknown."""
     yaw_rad = state.yaw_rad
@@ -145,6 +150,8 @@ def pose_of(
         role,
         state.armed and state.landed is not LandedState.ON_GROUND,
         formation,
+        in_command,
+        state.mode.value,
     )
 
 
@@ -181,6 +188,8 @@ def pose_from_message(message: Any) -> Pose:
         role,
         fields.value("airborne") is True,
         None if formation is None else _note_from(formation),
+        fields.flag("in_command"),
+        fields.text("mode") if "mode" in fields.names else "unknown",
     )
 
 
@@ -238,6 +247,13 @@ class _Fields:
         value = self.value(key)
         if not isinstance(value, str) or not 1 <= len(value) <= 100:
             raise PoseError(f"{self._what}: {key} must be a string of 1 to 100 characters, got {value!r:.50}")
+        return value
+
+    def flag(self, key: str) -> bool | None:
+        """None where it is not published."""
+        value = self.value(key) if key in self._message else None
+        if value is not None and not isinstance(value, bool):
+            raise PoseError(f"{self._what}: {key} must be true, false or null, got {value!r:.50}")
         return value
 
     def number(self, key: str, low: float, high: float) -> float:

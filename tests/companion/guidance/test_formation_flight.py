@@ -15,7 +15,9 @@ from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.behaviours.goto import GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits
+from companion.vehicle.state import FlightMode
 
 GRID = [(0.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 6.0), (-12.0, 0.0), (-12.0, -6.0), (-12.0, 6.0)]
 
@@ -86,6 +88,48 @@ def test_followers_keep_their_slots_through_turns(shape: str) -> None:
     # All agree on the assignment of the first vehicle by name.
     assert sorted(slots(fleet, "b").values()) == [1, 2, 3]
     assert not slots(fleet, "c")
+
+
+def notes(fleet: Fleet, name: str) -> list[str]:
+    events = fleet.members[name].flight.events
+    return [event.message for event in events if event.kind is EventKind.NOTED]
+
+
+@pytest.mark.parametrize("as_text", [True, False])
+@pytest.mark.parametrize(
+    "mode",
+    [FlightMode.RETURN, FlightMode.LAND, FlightMode.POSITION, FlightMode.MANUAL, FlightMode.HOLD],
+)
+def test_follower_says_when_its_leader_was_taken(mode: FlightMode, as_text: bool) -> None:
+    fleet = flying(2, as_text=as_text)
+    follow(fleet, "b")
+    fleet.run(3.0)
+    follower, leader = fleet.members["b"].flight.guidance, fleet.members["a"]
+    assert notes(fleet, "b") == []
+    assert isinstance(leader.airframe, PointAirframe)
+    leader.airframe._mode = mode  # by its pilot, or a failsafe
+    fleet.run(1.0)
+    (taken,) = notes(fleet, "b")
+    assert "leader a is not flown by its service any more" in taken
+    assert f"mode {mode.value}" in taken
+    assert "a is not flown by its service" in follower.status
+    assert fleet.members["b"].outcome is None or ended(fleet, "b").success
+    assert fleet.command("a", HoldBehaviour()) is None
+    fleet.run(1.5)
+    assert notes(fleet, "b")[1:] == ["the leader a is flown by its service again"]
+    assert "not flown" not in follower.status
+
+
+def test_follower_says_that_its_leader_was_never_commanded() -> None:
+    fleet = flying(2)
+    leader = fleet.members["a"].airframe
+    assert isinstance(leader, PointAirframe)
+    leader._mode = FlightMode.POSITION
+    fleet.run(1.0)
+    follow(fleet, "b")
+    fleet.run(1.0)
+    (words,) = notes(fleet, "b")
+    assert "leader a is not flown by its service, but" in words
 
 
 def test_joining_vehicle_gets_a_slot_with_separation() -> None:

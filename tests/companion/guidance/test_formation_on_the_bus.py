@@ -54,7 +54,12 @@ class Companion:
 
     async def publish(self) -> None:
         while True:
-            pose = self.poses.pose(self.driver.state, self.guidance.behaviour, time.monotonic_ns())
+            pose = self.poses.pose(
+                self.driver.state,
+                self.guidance.behaviour,
+                time.monotonic_ns(),
+                in_command=self.guidance.in_command,
+            )
             if pose is not None:
                 self.bus.publish(topics.POSE, pose_message(pose))
             await asyncio.sleep(0.1)
@@ -131,7 +136,8 @@ async def test_vehicles_share_poses_and_fly_in_formation(vehicles: int) -> None:
             await until(lambda: max(map(error_m, followers)) < 1.0)
 
             def role() -> object:
-                pose = leader.poses.pose(leader.driver.state, None, time.monotonic_ns())
+                now_ns = time.monotonic_ns()
+                pose = leader.poses.pose(leader.driver.state, None, now_ns, in_command=True)
                 assert pose is not None
                 return pose_message(pose)["role"]
 

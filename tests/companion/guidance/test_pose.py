@@ -30,6 +30,7 @@ NOTE = FormationNote(
     "alpha", Plan(3, "beta", "wedge", 5.0), 2, 0.25, (("beta", 1), ("gamma", 2)), 2, 0.5, -0.1, STRUCTURE
 )
 POSE = Pose("beta", "ab12", 5_000, 0.02, 47.4, 8.5, 491.0, (1.0, -2.0, 0.5), 1.5, 0.2, "follower", True, NOTE)
+TAKEN = replace(POSE, in_command=False, mode="return")
 NOW_NS = 10**12
 STATE = VehicleState(
     heartbeat_ns=NOW_NS,
@@ -50,10 +51,21 @@ STATE = VehicleState(
 
 @pytest.mark.parametrize(
     "pose",
-    [POSE, replace(POSE, formation=None), replace(POSE, formation=replace(NOTE, wish=None, structure=None))],
+    [
+        TAKEN,
+        replace(POSE, in_command=True, mode="offboard"),
+        replace(TAKEN, formation=None),
+        replace(POSE, formation=replace(NOTE, wish=None, structure=None)),
+    ],
 )
 def test_pose_message_round_trip(pose: Pose) -> None:
     assert pose_from_message(json.loads(json.dumps(pose_message(pose)))) == pose
+
+
+def test_pose_of_another_program_has_no_command_or_mode() -> None:
+    message = json.loads(json.dumps(pose_message(TAKEN)))
+    del message["in_command"], message["mode"]
+    assert pose_from_message(message) == replace(TAKEN, in_command=None, mode="unknown")
 
 
 def test_pose_has_position_and_age() -> None:
@@ -103,6 +115,8 @@ def test_turn_rate_from_body_rates_and_roll() -> None:
         (("published_ns",), 2**70, "integer"),
         (("role",), "king", "role must be one of"),
         (("vehicle",), "", "100 characters"),
+        (("in_command",), 1, "in_command must be"),
+        (("mode",), 4, "mode must be"),
         (("formation", "plan", "shape"), "star", "shape must be one of"),
         (("formation", "plan", "spacing_m"), 0.0, "spacing_m must be"),
         (("formation", "slots"), {"beta": 0}, "beta must be"),
@@ -120,7 +134,7 @@ def test_invalid_field_is_rejected_by_name(path: Sequence[str | int], value: obj
         pose_from_message(message)
 
 
-@pytest.mark.parametrize("key", list(pose_message(POSE)))
+@pytest.mark.parametrize("key", sorted(set(pose_message(POSE)) - {"in_command", "mode"}))
 def test_missing_field_is_rejected(key: str) -> None:
     message: dict[str, Any] = {**pose_message(POSE)}
     del message[key]
