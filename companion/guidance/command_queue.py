@@ -40,13 +40,17 @@ class CommandQueue:
 
     Args:
         gimbal: carries out commands that only point the gimbal.
+
+    Attributes:
+        due: to be taken in this step. waiting: for what they need.
+        mode_changes: as given to `watch`; None before.
     """
 
     def __init__(self, gimbal: GimbalController) -> None:
         self._gimbal = gimbal
-        self._due: list[CommandInput] = []
-        self._waiting: list[_Waiting] = []
-        self._mode_changes: int | None = None
+        self.due: list[CommandInput] = []
+        self.waiting: list[_Waiting] = []
+        self.mode_changes: int | None = None
 
     def add(
         self,
@@ -57,7 +61,7 @@ class CommandQueue:
     ) -> None:
         """Add a new command. `gimbal_user`: name of the behaviour that moves the gimbal now; empty: none."""
         self.supersede(command.text, out)
-        if command.mode_changes not in (None, self._mode_changes):
+        if command.mode_changes not in (None, self.mode_changes):
             out.ended(command.identifier, Outcome(False, f"superseded by {_change(context.state)}"))
             return
         if command.aim is not None and gimbal_user:
@@ -65,52 +69,52 @@ class CommandQueue:
             out.ended(command.identifier, Outcome(False, reason))
             return
         if not (awaited := _awaited(command, context)):
-            self._due.append(command)
+            self.due.append(command)
             return
-        self._waiting.append(_Waiting(command, context.now_ns + FIND_TIMEOUT_S * 1e9, awaited))
+        self.waiting.append(_Waiting(command, context.now_ns + FIND_TIMEOUT_S * 1e9, awaited))
         if awaited == _GIMBAL:
             self._gimbal.find(out)
 
     def watch(self, mode_changes: int, state: VehicleState, out: OutputCollector) -> None:
         """Supersede waiting commands after a change of mode or arming."""
-        if self._mode_changes is not None and mode_changes != self._mode_changes:
-            unknown = [waiting for waiting in self._waiting if waiting.awaited == _AUTOPILOT]
-            self._waiting = [waiting for waiting in self._waiting if waiting.awaited != _AUTOPILOT]
+        if self.mode_changes is not None and mode_changes != self.mode_changes:
+            unknown = [waiting for waiting in self.waiting if waiting.awaited == _AUTOPILOT]
+            self.waiting = [waiting for waiting in self.waiting if waiting.awaited != _AUTOPILOT]
             self.supersede(_change(state), out)
-            self._waiting += unknown
-        self._mode_changes = mode_changes
+            self.waiting += unknown
+        self.mode_changes = mode_changes
 
     def supersede(self, by: str, out: OutputCollector) -> None:
         """Answer waiting behaviours as superseded. `by`: the cause, for the answer."""
         left = []
-        for waiting in self._waiting:
+        for waiting in self.waiting:
             if waiting.command.behaviour is None:  # gimbal only
                 left.append(waiting)
             else:
                 reason = f"superseded by {by} while waiting for {waiting.awaited}"
                 out.ended(waiting.command.identifier, Outcome(False, reason))
-        self._waiting = left
+        self.waiting = left
 
     def close(self, out: OutputCollector) -> None:
         """The service ends: answer every waiting command."""
         self.supersede("the end of the service", out)
-        for waiting in self._waiting:
+        for waiting in self.waiting:
             out.ended(waiting.command.identifier, Outcome(False, ENDING))
-        self._waiting = []
+        self.waiting = []
 
     def take_due(self, context: BehaviourContext, out: OutputCollector) -> list[CommandInput]:
         """Remove and return the behaviours to begin now, in order. Gimbal commands go to the gimbal."""
         now_ns = context.now_ns
         due, left = list[CommandInput](), list[_Waiting]()
-        for waiting in self._waiting:
+        for waiting in self.waiting:
             awaited = _awaited(waiting.command, context)
             found = not awaited or (awaited == _GIMBAL and self._gimbal.not_found)
             if found or now_ns > waiting.until_ns:
                 due.append(waiting.command)
             else:
                 left.append(waiting)
-        self._waiting = left
-        due, self._due = [*due, *self._due], []
+        self.waiting = left
+        due, self.due = [*due, *self.due], []
         for command in due:
             if command.aim is not None:
                 self._gimbal.point(command.identifier, command.aim, context, out)

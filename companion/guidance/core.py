@@ -16,7 +16,7 @@ import math
 from dataclasses import dataclass, replace
 
 from companion.clock import BUFFERED_S, Standstill
-from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome, Requirement
+from companion.guidance.behaviour import NO_GIMBAL, Behaviour, BehaviourContext, Outcome, Requirement
 from companion.guidance.behaviour_runner import BehaviourRunner
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command_queue import CommandQueue, ends_flight
@@ -88,6 +88,7 @@ class Guidance:
         self._objects: tuple[TrackedObject, ...] = ()
         self._marker_objects: tuple[TrackedObject, ...] = ()
         self._choices: dict[Subject, Choice] = {}
+        self._has_gimbal = False
         self._queue = CommandQueue(self.gimbal)
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
         # Of the steering camera, and of those that look down.
@@ -209,7 +210,8 @@ class Guidance:
             self._modes.release()
             self.gimbal.end(now_ns, inputs.state, out)
             return self._output(None, released=self.gimbal.released)
-        self._queue.watch(inputs.mode_changes, inputs.state, out)
+        if inputs.mode_changes != self._queue.mode_changes:
+            self._queue.watch(inputs.mode_changes, inputs.state, out)
         if inputs.standstill is not None:
             self._end_after(inputs.standstill, now_ns)
         for command in inputs.commands:
@@ -217,13 +219,15 @@ class Guidance:
                 out.ended(command.identifier, Outcome(False, why))
                 continue
             self._queue.add(command, context, self._runner.gimbal_user, out)
-        for command in self._queue.take_due(context, out):
-            self._begin_command(command, context)
+        if self._queue.due or self._queue.waiting:
+            for command in self._queue.take_due(context, out):
+                self._begin_command(command, context)
         landing_target = None
         try:
             self._runner.update(context, before, inputs)
             landing_target = self._new_landing_target()
-            self.gimbal.update(context, self._runner.active, out)
+            if self._has_gimbal:
+                self.gimbal.update(context, self._runner.active, out)
         except Exception as error:
             self._runner.handle_error(error, context, inputs.stream.sent_count)
         else:
@@ -277,7 +281,9 @@ class Guidance:
 
     def _observe(self, now_ns: int, inputs: GuidanceInput) -> BehaviourContext:
         """The input of behaviours, without targets that are too old or whose camera direction is unknown."""
-        gimbal = self.gimbal.snapshot(now_ns, inputs.state)
+        if inputs.state.gimbal is not None or self.gimbal.mounting.carries_camera:
+            self._has_gimbal = True
+        gimbal = self.gimbal.snapshot(now_ns, inputs.state) if self._has_gimbal else NO_GIMBAL
         age_s = None if inputs.seen_ns is None else (now_ns - inputs.seen_ns) / 1e9
         fresh = (
             age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.direction_fault
@@ -352,7 +358,7 @@ class Guidance:
             tuple(out.cancelled),
             landing_target,
             self._due_obstacles(),
-            self._setpoints.take_path_request(),
+            self._setpoints.take_path_request() if self._options.avoid else None,
             tuple(out.events),
             tuple(out.results),
             released,

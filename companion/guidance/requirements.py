@@ -91,7 +91,7 @@ def _missing(
                 if (why := context.ranging.missing(_class_names(behaviour, context))) is not None:
                     missing.append(why)
             case Requirement.NEIGHBOURS:
-                missing += missing_neighbours(context.neighbourhood, behaviour.neighbour_names)
+                missing += missing_neighbours(context.neighbourhood, behaviour.neighbour_names, state, now_ns)
             case Requirement.STEERING_MARKER if (
                 what := context.steering_markers.unavailable(PERCEPTION_GAP_S)
             ) is not None:

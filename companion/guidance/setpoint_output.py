@@ -116,7 +116,7 @@ class SetpointOutput:
         """Send a setpoint after the envelope; a brake where required depth is missing."""
         # The lifetime is the operator's setting, not the behaviour's.
         asked = replace(setpoint, deadline_ns=context.now_ns + round(self._lifetime_s * 1e9))
-        blind = self._obstacles.blind(context)
+        blind = self._obstacles.blind(context) if self._uses_depth(context) else None
         self._report_perception_fault(behaviour, blind)
         if blind is not None:
             self.brake(context)
@@ -139,10 +139,15 @@ class SetpointOutput:
 
     def _obstacle_constraints(self, context: BehaviourContext) -> tuple[Constraint, ...]:
         """The obstacle limits of this step."""
+        if not self._uses_depth(context):
+            return ()
         if self._constrained is None or self._constrained[0] is not context:
             filled = self._memory.filled(context, self._obstacles.margin_m)
             self._constrained = (context, self._obstacles.constraints(filled))
         return self._constrained[1]
+
+    def _uses_depth(self, context: BehaviourContext) -> bool:
+        return context.obstacles is not None or self._obstacles.use == "required"
 
     def _report_perception_fault(self, behaviour: str, blind: str | None) -> None:
         """Log once that the vehicle brakes without depth, and once that depth is back."""

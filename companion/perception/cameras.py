@@ -90,6 +90,7 @@ class PerceptionCamera:
         self.path_request: PathRequest | None = None
         self._class_names = class_names
         self._has_depth = False
+        self._ranging: tuple[tuple[object, ...], RangeMeans] | None = None
         self._repeated = ""
         self._valid_from_ns = 0
         self._between_s: deque[float] = deque(maxlen=9)
@@ -135,9 +136,12 @@ class PerceptionCamera:
         newest = self.newest
         if newest is None:
             return ALL_MEANS
-        camera = self.settings.camera.model(newest.width, newest.height)
-        heights = frozenset(self.settings.detector.heights())
-        return RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
+        of = (newest.width, newest.height, pitch_rad, self._has_depth, self.settings)
+        if self._ranging is None or self._ranging[0] != of:
+            camera = self.settings.camera.model(newest.width, newest.height)
+            heights = frozenset(self.settings.detector.heights())
+            self._ranging = of, RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
+        return self._ranging[1]
 
     def discard_received(self, now_ns: int) -> None:
         """What was received is outdated, and so is a result of an image from before, when it arrives."""

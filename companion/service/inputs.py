@@ -14,11 +14,12 @@ from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
+from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
 from companion.guidance.objects.from_detections import StateHistory
-from companion.guidance.objects.from_markers import LocalizedMarkers
+from companion.guidance.objects.from_markers import NO_MARKERS, LocalizedMarkers
 from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.perception.cameras import PerceptionCamera
@@ -68,7 +69,9 @@ class InputAssembler:
         self.poses = PoseSharing(settings.vehicle.name, on_event)
         self.velocities = VelocitySenders()
         self.parameters = NOTHING_READ
-        self._markers = MarkerTracker(cameras, on_event)
+        self._alone = Neighbourhood(settings.vehicle.name)
+        detecting = any(camera.settings.markers.dictionary is not None for camera in cameras)
+        self._markers = MarkerTracker(cameras, on_event) if detecting else None
         self._state: VehicleState | None = None
         self._shown: tuple[int, bool] | None = None
         self._mode_changes = 0
@@ -92,12 +95,13 @@ class InputAssembler:
 
     def on_result(self, camera: PerceptionCamera, result: PerceptionResult) -> LocalizedMarkers | None:
         """Process a camera's result, unless it repeats one; returns its markers if marker detection is on."""
-        self._freezes.update(camera, result.captured_ns)
+        if camera.repeats or self._freezes.frozen:
+            self._freezes.update(camera, result.captured_ns)
         if camera.repeats:
             return None
         if camera is self.steering:
             camera.localize(result, self.history)
-        if result.markers is None:
+        if result.markers is None or self._markers is None:
             return None
         return self._markers.localize(camera, result, self.history, self._state)
 
@@ -113,7 +117,9 @@ class InputAssembler:
         standstill: Standstill | None = None,
     ) -> GuidanceInput:
         """Assemble the input of one step."""
-        steering = self.steering
+        # What the vehicle does not have is not asked: markers, other vehicles, senders of velocities.
+        steering, markers = self.steering, self._markers
+        max_age_s = self._settings.guidance.perception_max_age_s
         return GuidanceInput(
             state,
             stream,
@@ -121,21 +127,21 @@ class InputAssembler:
             steering.seen_ns,
             steering.obstacles,
             steering.planned,
-            self._markers.sight(now_ns, self._settings.guidance.perception_max_age_s),
-            self.poses.neighbourhood(state, now_ns),
+            NO_MARKERS if markers is None else markers.sight(now_ns, max_age_s),
+            self.poses.neighbourhood(state, now_ns) if self.poses.heard else self._alone,
             steering.ranging(self.camera_pitch_rad(state)),
             steering.class_names,
             self._mode_changes,
             tuple(answers),
             tuple(commands),
             ending,
-            self._markers.steering_sight(self.steering, now_ns, self._settings.guidance.perception_max_age_s),
-            self.velocities.newest(now_ns),
+            NO_MARKERS if markers is None else markers.steering_sight(self.steering, now_ns, max_age_s),
+            self.velocities.newest(now_ns) if self.velocities.heard else (),
             self.parameters,
             standstill,
             steering.frozen(now_ns),
             steering.objects.objects,
-            self._markers.objects(steering),
+            () if markers is None else markers.objects(steering),
         )
 
     def discard_received(self, now_ns: int) -> None:
@@ -143,7 +149,8 @@ class InputAssembler:
         self.history.discard()
         for camera in self._cameras.values():
             camera.discard_received(now_ns)
-        self._markers.discard_received()
+        if self._markers is not None:
+            self._markers.discard_received()
         self.poses.discard_received(now_ns)
         self.velocities.discard_received(now_ns)
 

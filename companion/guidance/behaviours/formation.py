@@ -27,7 +27,7 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.formation.group import Agreement, Group
-from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.formation.neighbours import Neighbour, Neighbourhood, anchored
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
 from companion.guidance.formation.separation import MARGIN_M, avoid, repulsion
 from companion.guidance.formation.virtual_structure import VirtualStructure
@@ -182,6 +182,8 @@ class FormationBehaviour(Behaviour):
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         hood = context.neighbourhood
+        if hood is not None:
+            hood = anchored(hood, context.state, context.now_ns)
         if hood is None or hood.problem is not None or hood.anchor is None:
             return self._without_leader(context, "pose sharing is off" if hood is None else hood.problem)
         leader = self._leader(dt_s, context, hood)

@@ -8,7 +8,7 @@ receipt. It is too small by the network's minimum delay, a few milliseconds on a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from companion.geometry.geodesy import north_east
 from companion.guidance.formation.pose import FormationNote, Pose, global_problem
@@ -61,8 +61,8 @@ class Neighbourhood:
 
     Attributes:
         own: the name of this vehicle. vehicles: the others, sorted by name.
-        problem: why their positions are unknown; None: they are known.
-        anchor: converts between global and local positions.
+        problem: why their positions are unknown; None: they are known, or there are none.
+        anchor: converts between global and local positions; None where there is a problem, or no vehicle.
     """
 
     own: str
@@ -74,10 +74,22 @@ class Neighbourhood:
         return next((vehicle for vehicle in self.vehicles if vehicle.name == name), None)
 
 
-def missing_neighbours(neighbourhood: Neighbourhood | None, names: Sequence[str]) -> list[str]:
+def anchored(neighbourhood: Neighbourhood, state: VehicleState, now_ns: int) -> Neighbourhood:
+    """The neighbourhood with its anchor, or the problem, where no other vehicle was received."""
+    if neighbourhood.vehicles or neighbourhood.anchor is not None or neighbourhood.problem is not None:
+        return neighbourhood
+    anchor = Anchor.of(state, now_ns)
+    problem = None if anchor else global_problem(state, now_ns) or "own position unknown"
+    return replace(neighbourhood, anchor=anchor, problem=problem)
+
+
+def missing_neighbours(
+    neighbourhood: Neighbourhood | None, names: Sequence[str], state: VehicleState, now_ns: int
+) -> list[str]:
     """What is missing for a behaviour that needs these vehicles, in words; empty: nothing."""
     if neighbourhood is None:
         return ["neighbours (this service does not share poses)"]
+    neighbourhood = anchored(neighbourhood, state, now_ns)
     if neighbourhood.problem is not None:
         return [f"neighbours ({neighbourhood.problem})"]
     received = [vehicle.name for vehicle in neighbourhood.vehicles if not vehicle.silent]
@@ -191,14 +203,14 @@ class Neighbours:
             name for name, received in self._received.items() if _age_s(received, now_ns) > FORGET_S
         ]:
             del self._received[name]
-        anchor = Anchor.of(state, now_ns)
-        if anchor is None:
-            return Neighbourhood(self.own, problem=global_problem(state, now_ns) or "own position unknown")
+        alone = anchored(Neighbourhood(self.own), state, now_ns)
+        if (anchor := alone.anchor) is None:
+            return alone
         vehicles = tuple(
             _predicted(name, received, anchor, _age_s(received, now_ns))
             for name, received in sorted(self._received.items())
         )
-        return Neighbourhood(self.own, vehicles, None, anchor)
+        return replace(alone, vehicles=vehicles)
 
     def leads(self) -> bool:
         """Whether another vehicle follows this one."""

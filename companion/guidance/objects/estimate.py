@@ -15,7 +15,6 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry import gate
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.geolocation import position_covariance
@@ -155,8 +154,8 @@ class Estimate:
 def squared_distance(offset: Vector, covariance: Vector) -> float:
     """Mahalanobis distance squared of a (2,) offset, by a (2, 2) covariance."""
     (nn, ne), (_, ee) = covariance.tolist()
-    north_m, east_m = offset.tolist()
-    return gate.squared_distance(north_m, east_m, (nn, ne, ee))
+    north, east = offset.tolist()
+    return float((ee * north * north - 2.0 * ne * north * east + nn * east * east) / (nn * ee - ne * ne))
 
 
 def acceleration_noise(elapsed_s: float) -> NDArray[np.float64]:

@@ -19,6 +19,7 @@ from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
     STEP_S,
     GuidanceHarness,
+    ScriptedGimbal,
     assert_failed,
     engaged,
     flying,
@@ -178,6 +179,7 @@ def test_a_gimbal_controller_that_fails_is_logged_once(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     harness = GuidanceHarness(flying())
+    harness.autopilot.gimbal = ScriptedGimbal()
     engaged(harness)
 
     def failing(*_: object) -> None:

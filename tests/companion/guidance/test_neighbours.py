@@ -10,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Requirement
-from companion.guidance.formation.neighbours import Anchor, Neighbour, Neighbours, missing_neighbours
+from companion.guidance.formation.neighbours import (
+    Anchor,
+    Neighbour,
+    Neighbourhood,
+    Neighbours,
+    missing_neighbours,
+)
 from companion.guidance.formation.pose import Pose
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.state import Vector3, VehicleState
@@ -151,11 +157,14 @@ def test_missing_neighbour_is_named_in_the_reply() -> None:
     neighbours.ingest(pose(1), NOW_NS)
     assert words(NOW_NS) is None
     assert "alpha (stale: 2.0 s)" in (words(NOW_NS + 2 * SECOND) or "")
-    (alone,) = missing_neighbours(None, ())
+    (alone,) = missing_neighbours(None, (), state_at(NOW_NS), NOW_NS)
     assert alone.startswith("neighbours (")
     assert "not share poses" in alone
     lost = neighbours.neighbourhood(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
-    assert "s old" in missing_neighbours(lost, ())[0]
-    assert (
-        "than itself" in missing_neighbours(neighbours.neighbourhood(state_at(NOW_NS), NOW_NS), ("beta",))[0]
-    )
+    assert "s old" in missing_neighbours(lost, (), state_at(NOW_NS), NOW_NS)[0]
+    here = neighbours.neighbourhood(state_at(NOW_NS), NOW_NS)
+    assert "than itself" in missing_neighbours(here, ("beta",), state_at(NOW_NS), NOW_NS)[0]
+    # Without any other vehicle the own position is asked for when a behaviour needs it.
+    nobody = Neighbourhood("beta")
+    assert missing_neighbours(nobody, (), state_at(NOW_NS), NOW_NS) == []
+    assert "s old" in missing_neighbours(nobody, (), replace(state_at(NOW_NS), global_ns=0), NOW_NS)[0]
