@@ -93,7 +93,7 @@ class Guidance:
         self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
         # Of the steering camera, and of those that look down.
         self._closing, self._closing_below = ClosingCheck(), ClosingCheck()
-        self._approaching: Behaviour | None = None
+        self._approaching: tuple[Behaviour | None, int] = None, 0
         self._context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
@@ -329,8 +329,10 @@ class Guidance:
         if not self._runner.busy:
             self._closing.reset()
             self._closing_below.reset()
-        if active is not self._approaching:  # the next step of a mission: another object
-            self._approaching = active
+        resets = context.state.reset_count
+        # The next step of a mission: another object. A reset of the height: other ranges by the ground.
+        if active is not self._approaching[0] or resets != self._approaching[1]:
+            self._approaching = active, resets
             self._closing.begin_again()
             self._closing_below.begin_again()
         if position is not None:

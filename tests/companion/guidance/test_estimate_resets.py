@@ -7,9 +7,13 @@ from dataclasses import replace
 
 import pytest
 
+from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
+from companion.bench.synthetic_camera import SyntheticCamera
+from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.interface import EventKind, GuidanceInput
 from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, in_the_air
+from vision.camera_model import CameraModel, CameraMount
 
 RESET_NED_M = (5.0, 3.0, -1.0)
 RESET = "ekf_reset 5 3 -1"
@@ -120,3 +124,51 @@ def test_invalid_estimate_brakes_and_then_ends_command() -> None:
     reason = harness.outcome(pending).reason
     assert "attitude lost" in reason
     assert "estimator" in reason
+
+
+def positions_of_car(autopilot: str, command: str, fault: str = "") -> list[tuple[int, float, float]]:
+    """(id, north, east) of the object ten times a second, from the moment of a fault."""
+    place = ScenePose(18.0, 1.0, 0.3)
+    scene = [SceneObject("car", (4.2, 1.8, 1.5), lambda _: place)]
+    camera = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+    mount = CameraMount(pitch_rad=math.radians(-15.0))
+    detector = SyntheticDetector(scene, camera, mount, seed=5)
+    seen = SyntheticCamera(camera_settings(camera, mount, {}), detect=detector)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=4, autopilot=autopilot), camera=seen)
+    flight.run(1.0)
+    identifier = flight.command(command)
+    flight.run(2.5)
+    if fault:
+        flight.vehicle.vehicle.faults.begin(fault)
+    found = []
+    for _ in range(60):
+        flight.run(0.1)
+        located = [
+            (math.dist(each.position_ned_m[:2], (18.0, 1.0)), each.object_id, each.position_ned_m)
+            for each in seen.perceived.objects.objects
+            if each.confirmed and each.position_ned_m is not None
+        ]
+        _, object_id, (north, east, _) = min(located)
+        found.append((object_id, north, east))
+    assert flight.state.reset_count == (1 if fault else 0)
+    outcome = flight.outcome(identifier)
+    assert outcome is None or outcome.success
+    return found
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("command", ["approach car distance=5", "orbit car radius=6"])
+def test_object_stays_where_it_is_through_a_reset(autopilot: str, command: str) -> None:
+    """Local NED is that of the first connection, so the table of objects has nothing to shift."""
+    still = positions_of_car(autopilot, command)
+    reset = positions_of_car(autopilot, command, "ekf_reset 5 3 0")
+    assert [each[0] for each in still] == [each[0] for each in reset]
+    apart = [math.dist(one[1:], other[1:]) for one, other in zip(still, reset, strict=True)]
+    assert max(apart) < 0.5  # the estimate was reset by 5.8 m
+
+
+def test_object_is_the_same_one_when_the_height_is_reset() -> None:
+    """Ranges by the ground change with the height: 1 m of height is 3 m at this angle."""
+    found = positions_of_car("px4", "approach car distance=5", RESET)
+    assert {each[0] for each in found} == {found[0][0]}
+    assert math.dist(found[-1][1:], (18.0, 1.0)) < 1.5
