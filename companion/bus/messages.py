@@ -99,7 +99,11 @@ def detections_message(
         first_ns = detections.track_first_ns.tolist()
         ages_s = [round((result.captured_ns - first) / 1e9, 3) if first else None for first in first_ns]
     origin = localized.origin
-    object_ids = {id(each.detection): each.object_id for each in localized.objects if not each.occluded}
+    object_ids: dict[tuple[str, tuple[float, ...]], int] = {
+        (each.detection.class_name, each.detection.box_xyxy): each.object_id
+        for each in localized.objects
+        if not each.occluded
+    }
     return {
         **_of_frame(result, vehicle, published_ns, view),
         "captured_boot_ns": None if clock is None else result.captured_ns + clock.offset_ns,
@@ -111,9 +115,9 @@ def detections_message(
         "timing_ms": {stage: round(value, 2) for stage, value in result.timing_ms.items()},
         "dropped": result.dropped,
         "detections": [
-            _detection(record, age_s, target, origin, None if target is None else object_ids.get(id(target)))
+            _detection(record, age_s, targets.get(box), origin, object_ids.get(box))
             for record, age_s in zip(records, ages_s, strict=True)
-            for target in [targets.get((record["class_name"], tuple(record["xyxy"])))]
+            for box in [(record["class_name"], tuple(record["xyxy"]))]
         ],
         "objects": [_object(each, origin) for each in localized.objects],
     }

@@ -158,8 +158,10 @@ class PositionFilter:
             # How far the newest detections are from the fused position is part of its error.
             behind = self.motion.state[:2] - place
             fused = fused + np.outer(behind, behind)
-        covariance = self.motion.covariance.copy()
-        covariance[:2, :2] = fused
+        # Scaled to it, so that position and velocity stay correlated as the filter has them.
+        scale = np.eye(4)
+        scale[:2, :2] = _root(fused) @ np.linalg.inv(_root(self.motion.covariance[:2, :2]))
+        covariance = scale @ self.motion.covariance @ scale.T
         covariance[:2, :2] += np.eye(2) * self._vehicle_sigma_m**2
         return (float(place[0]), float(place[1]), self._down_m), covariance
 
@@ -204,6 +206,13 @@ def _covariance(target: Target, vehicle: Vector3) -> NDArray[np.float64]:
         return stated
     assert target.position_ned_m is not None
     return measurement_noise(target, np.array(target.position_ned_m[:2]) - vehicle[:2])
+
+
+def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The symmetric square root."""
+    values, vectors = np.linalg.eigh(covariance)
+    root: NDArray[np.float64] = (vectors * np.sqrt(np.maximum(values, 1e-12))) @ vectors.T
+    return root
 
 
 def _height(target: Target) -> float:

@@ -8,6 +8,7 @@ hypothesis for a while: if another detection then fits the prediction far better
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -48,6 +49,8 @@ DIRECTION_RAD = 0.1
 # An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
 # while they fit each other: the filter begins again there.
 REFUSED = 3
+# No detection is farther away, and none is more exact: beyond these, numbers overflow.
+FARTHEST_M, NEAREST_M = 1e6, 1e-6
 # An object is forgotten after this long, and the longest unseen one where there are more than so many.
 FORGET_S, MOST_OBJECTS = 60.0, 256
 
@@ -112,8 +115,8 @@ class _Object:
 
     def value(self, newest_ns: int) -> TrackedObject:
         occluded = self.last_ns < newest_ns
-        known = self._value
-        if known is not None and known.occluded == occluded and known.ambiguous == self.ambiguous:
+        known, changing = self._value, (occluded, self.ambiguous, self.track_ids)
+        if known is not None and (known.occluded, known.ambiguous, known.track_ids) == changing:
             return known
         position, covariance = None, np.zeros((4, 4))
         if self.filter is not None:
@@ -156,7 +159,7 @@ class ObjectTable:
     def update(
         self, targets: Sequence[Target], vehicle: Vector3, captured_ns: int
     ) -> tuple[TrackedObject, ...]:
-        """Add one frame; a frame that is not newer than the last one changes nothing.
+        """Add one frame; one that is not newer than the last one, or of an unknown place, changes nothing.
 
         Args:
             targets: all of this capture; empty: the camera saw nothing.
@@ -167,7 +170,7 @@ class ObjectTable:
             Those of this frame, and the confirmed ones of the last `LONGEST_S`, the oldest first, each as of
             its newest detection.
         """
-        if captured_ns > self._newest_ns:
+        if captured_ns > self._newest_ns and all(map(math.isfinite, vehicle)):
             self._newest_ns = captured_ns
             _Frame(self, targets, vehicle, captured_ns).associate()
             self._forget()
@@ -217,7 +220,8 @@ class _Frame:
         self, table: ObjectTable, targets: Sequence[Target], vehicle: Vector3, captured_ns: int
     ) -> None:
         self._table, self._vehicle, self._now_ns = table, vehicle, captured_ns
-        self._left = _with_unique_ids(target for target in targets if target.captured_ns == captured_ns)
+        of_frame = (target for target in targets if target.captured_ns == captured_ns)
+        self._left = _with_unique_ids(filter(None, map(_usable, of_frame)))
         self._hidden = {id(each) for each in self._left if _is_hidden(each, self._left)}
         self._seen: dict[int, Target] = {}  # by object
         self._ways: dict[int, list[Estimate]] = {}
@@ -331,7 +335,7 @@ class _Frame:
                     continue
                 known, fit = own[0]
             young = self._owner(fit.target)
-            if young is not None and young is not known and young.object_id in self._seen:
+            if young is not None and young is not known and self._seen.get(young.object_id) is fit.target:
                 self._merge(young, known)
             self._take(known, fit.target)
 
@@ -504,6 +508,19 @@ class _Frame:
                 return fit.target
         near = [fit for fit in fits if fit.off_m <= REACH_M]
         return min(near, key=lambda fit: fit.off_m).target if near else None
+
+
+def _usable(target: Target) -> Target | None:
+    """The detection without numbers that are none, or out of all bounds; None without a direction."""
+    if not math.isfinite(target.bearing_rad + target.elevation_rad):
+        return None
+    position = target.position_ned_m
+    if position is not None and not all(abs(v) < FARTHEST_M for v in (*position, target.vehicle_sigma_m)):
+        return replace(target, position_ned_m=None, range_source=RangeSource.NONE, ground_range_m=math.nan)
+    along_m, across_m = target.range_sigma_m, target.across_sigma_m
+    if any(not NEAREST_M < sigma < FARTHEST_M and not math.isnan(sigma) for sigma in (along_m, across_m)):
+        return replace(target, range_sigma_m=math.nan, across_sigma_m=math.nan)
+    return target
 
 
 def _alike(best: Fit, second: Fit) -> bool:
