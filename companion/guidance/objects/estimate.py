@@ -58,6 +58,11 @@ class Fit(NamedTuple):
     spread: Vector
 
     @property
+    def unlikelihood(self) -> float:
+        """For comparing objects: of a distance alone, a vague expectation would explain everything better."""
+        return self.squared + math.log(np.linalg.det(self.spread))
+
+    @property
     def off_m(self) -> float:
         """Distance from the expected position."""
         return float(np.hypot(*self.innovation))

@@ -40,6 +40,8 @@ MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
 RESTART_SIGMA = 3.0
 # Not seen whole, with a range, for so long an object may be anywhere, although it is still detected.
 STALE_S = 2.5
+# Unseen for longer, an object that did not move is expected only where it stood.
+STOOD_S = 4.0
 # A box at the image's upper edge shows a part of an object if it is lower than this share of the newest box
 # that the edge did not cut off: of an object that leaves at the top, half of its width may be detected last.
 PART = 0.5
@@ -128,7 +130,8 @@ class PositionFilter:
     def at(self, now_ns: int, *, unseen: bool) -> list[Estimate]:
         """Where it may be: on its way; and, after a while `unseen`, where it stood, unless it surely moves.
 
-        From frame to frame the way is right; a noisy speed leads an unseen object away.
+        From frame to frame the way is right; a noisy speed leads an unseen object away, and after `STOOD_S`
+        its way could be anywhere, so that it would fit every other object's detections.
         """
         ways = [self.motion.at(now_ns)]
         if unseen and not self.moving:
@@ -137,7 +140,8 @@ class PositionFilter:
             covariance = np.diag([0.0] * 2 + [FIRST_VELOCITY_SIGMA_MPS**2] * 2)
             covariance[:2, :2] = fused + np.eye(2) * RANDOM_WALK_M2_PER_S * elapsed_s
             state = np.concatenate([place, (0.0, 0.0)])
-            ways.append(Estimate(state, covariance, now_ns, self.motion.source, True))
+            stood = Estimate(state, covariance, now_ns, self.motion.source, True)
+            ways = [stood] if elapsed_s > STOOD_S else [*ways, stood]
         return ways
 
     def begins_again(self, target: Target) -> bool:

@@ -325,7 +325,7 @@ class _Frame:
             if fits and not known.ambiguous:
                 chosen.setdefault(id(fits[0].target), []).append((known, fits[0]))
         for pairs in chosen.values():
-            pairs.sort(key=lambda pair: pair[1].squared)
+            pairs.sort(key=lambda pair: pair[1].unlikelihood)
             known, fit = pairs[0]
             if len(pairs) > 1 and fit.target.track_id is not None and _alike(fit, pairs[1][1]):
                 own = [pair for pair in pairs if pair[0].track_id == fit.target.track_id is not None]
@@ -371,6 +371,8 @@ class _Frame:
         Its id is newer than the object's last detection; or its owner is expected elsewhere, so that the id
         has gone to another object.
         """
+        if target.track_id is None and not known.track_ids:
+            return True  # without a tracker the place is all there is
         if not known.confirmed or not target.trusted:
             return False
         if target.position_ned_m is None and target.track_id is not None:
@@ -443,6 +445,7 @@ class _Frame:
             for each in self._table._objects.values()
             if each.object_id not in self._seen
             and not each.track_ids
+            and (each.refused or each.believes_id(self._now_ns))
             and each.class_name == target.class_name
             and (off_rad := abs(wrap_angle(each.newest.bearing_rad - target.bearing_rad))) < DIRECTION_RAD
         ]

@@ -1,4 +1,5 @@
 import math
+import random
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -6,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.one_object import OneObject
@@ -125,3 +127,47 @@ def test_box_on_the_object_may_replace_it_and_one_beside_may_not(left: float, sa
     assert track.track_id == 1
     assert track.update([replace(second, captured_ns=T0 + 2 * FRAME_NS)], vehicle) is same
     assert track.track_id == (2 if same else 1)
+
+
+def objects_seen(frames: Sequence[Sequence[Target]]) -> list[list[int]]:
+    """The ids of the objects that each frame shows; one frame in 0.1 s."""
+    table = ObjectTable()
+    shown = []
+    for frame, targets in enumerate(frames):
+        objects = table.update(targets, (0.0, 0.0, -5.0), T0 + frame * FRAME_NS)
+        shown.append([each.object_id for each in objects if not each.occluded])
+    return shown
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+@pytest.mark.parametrize("late", [0, 5])
+def test_two_alike_seen_again_after_a_turn_keep_their_ids(tracked: bool, late: int) -> None:
+    noise = random.Random(3)
+    cars = [(15.0, 3.0), (15.0, 9.0)]
+
+    def both(frame: int, new: int) -> list[Target]:
+        places = [(north + noise.gauss(0, 0.2), east + noise.gauss(0, 0.2)) for north, east in cars]
+        return [
+            replace(seen(place, frame=frame), track_id=new + number if tracked else None)
+            for number, place in enumerate(places)
+        ]
+
+    frames = [both(frame, 1) for frame in range(20)] + [[]] * 85
+    again = range(len(frames), len(frames) + 20)
+    frames += [both(frame, 11)[: 2 if frame >= again[0] + late else 1] for frame in again]
+    assert objects_seen(frames)[-1] == [1, 2]
+
+
+@pytest.mark.parametrize("source", [RangeSource.GROUND_PLANE, RangeSource.NONE])
+@pytest.mark.parametrize("trusted", [True, False])
+def test_without_a_tracker_a_standing_object_is_one(source: RangeSource, trusted: bool) -> None:
+    noise = random.Random(3)
+    frames = [
+        [replace(seen((15.0, noise.gauss(3.0, 0.2)), frame=frame, source=source), trusted=trusted)]
+        if not 20 <= frame < 30
+        else []
+        for frame in range(60)
+    ]
+    shown = objects_seen(frames)
+    assert len({tuple(ids) for ids in shown[:20]}) == 1
+    assert len({tuple(ids) for ids in shown[30:]}) == 1
