@@ -25,8 +25,8 @@ from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
 # Unseen, the gate grows without bound: a new track id is associated no farther than this from the expected
-# position, plus so much per second; and not after an object has been unseen for longer than LONGEST_S.
-REACH_M, REACH_MPS, LONGEST_S = 1.5, 1.0, 10.0
+# position, plus so much per second; after LONGEST_S only to one that stood, and within STOOD_M of its place.
+REACH_M, REACH_MPS, LONGEST_S, STOOD_M = 1.5, 1.0, 10.0, 3.0
 # Of two detections near the expected position one is associated only if it fits better by this factor. Below
 # these squared distances fits count as equal (in general; after an occlusion).
 CLEARLY_NEARER = 3.0
@@ -242,17 +242,33 @@ class _Frame:
         """How well a detection fits an object with a position, and where that was expected for it."""
         key = known.object_id, id(target)
         if key not in self._fits:
-            ways = self._ways.get(known.object_id)
-            if ways is None:
-                assert known.filter is not None
-                ways = known.filter.at(self._now_ns, unseen=known.was_occluded(self._now_ns))
-                self._ways[known.object_id] = ways
             measured = target
             if self._partly_hidden(known, target):
                 measured = replace(target, position_ned_m=None, range_source=RangeSource.NONE)
-            fits = [(way, way.fit(measured, self._vehicle)._replace(target=target)) for way in ways]
+            fits = [
+                (way, way.fit(measured, self._vehicle)._replace(target=target))
+                for way in self._ways_of(known)
+            ]
             self._fits[key] = min(fits, key=lambda pair: pair[1].squared)
         return self._fits[key]
+
+    def _ways_of(self, known: _Object) -> list[Estimate]:
+        """Where an object with a position may be now."""
+        if known.object_id not in self._ways:
+            assert known.filter is not None
+            ways = known.filter.at(self._now_ns, unseen=known.was_occluded(self._now_ns))
+            self._ways[known.object_id] = ways
+        return self._ways[known.object_id]
+
+    def _out_of_reach(self, known: _Object, target: Target, reach_m: float) -> bool:
+        """Whether it is surely too far away: much faster than `_fit`, and true for most."""
+        place = target.position_ned_m
+        if place is None or self._partly_hidden(known, target):
+            return False
+        return all(
+            math.hypot(place[0] - way.state[0], place[1] - way.state[1]) > reach_m
+            for way in self._ways_of(known)
+        )
 
     def _partly_hidden(self, known: _Object, target: Target) -> bool:
         """Whether a detection shows a part of this object, and all of it was seen lately."""
@@ -342,15 +358,16 @@ class _Frame:
     def _fitting(self, known: _Object) -> list[Fit]:
         """The detections that may be an object which is not seen with its own id, the best fit first."""
         unseen_s = known.unseen_s(self._now_ns)
-        if unseen_s > LONGEST_S:
-            return []
         reach_m = REACH_M + REACH_MPS * unseen_s
+        if unseen_s > LONGEST_S:
+            assert known.filter is not None
+            reach_m = 0.0 if known.filter.moving else STOOD_M
         fits = []
         for target in (*self._left, *self._seen.values()):
             if target.class_name != known.class_name:
                 continue
             own = target.track_id is not None and target.track_id == known.track_id
-            if not own and not self._may_be(known, target):
+            if not own and (self._out_of_reach(known, target, reach_m) or not self._may_be(known, target)):
                 continue
             _, fit = self._fit(known, target)
             near = fit.off_m <= reach_m

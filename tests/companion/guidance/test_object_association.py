@@ -141,7 +141,8 @@ def objects_seen(frames: Sequence[Sequence[Target]]) -> list[list[int]]:
 
 @pytest.mark.parametrize("tracked", [True, False])
 @pytest.mark.parametrize("late", [0, 5])
-def test_two_alike_seen_again_after_a_turn_keep_their_ids(tracked: bool, late: int) -> None:
+@pytest.mark.parametrize("unseen", [85, 300])
+def test_two_alike_seen_again_after_a_turn_keep_their_ids(tracked: bool, late: int, unseen: int) -> None:
     noise = random.Random(3)
     cars = [(15.0, 3.0), (15.0, 9.0)]
 
@@ -152,7 +153,7 @@ def test_two_alike_seen_again_after_a_turn_keep_their_ids(tracked: bool, late: i
             for number, place in enumerate(places)
         ]
 
-    frames = [both(frame, 1) for frame in range(20)] + [[]] * 85
+    frames = [both(frame, 1) for frame in range(20)] + [[]] * unseen
     again = range(len(frames), len(frames) + 20)
     frames += [both(frame, 11)[: 2 if frame >= again[0] + late else 1] for frame in again]
     assert objects_seen(frames)[-1] == [1, 2]
