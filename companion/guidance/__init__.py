@@ -14,7 +14,7 @@ from companion.guidance.behaviours.goto import Goto
 from companion.guidance.behaviours.follow_path import FollowPath
 from companion.guidance.behaviours.figure_eight import FigureEight
 from companion.guidance.behaviours.orbit import Orbit
-from companion.guidance.behaviours.search import Seek
+from companion.guidance.behaviours.seek import Seek
 from companion.guidance.behaviours.approach_with_retry import Approach
 from companion.guidance.behaviours.follow import Follow
 from companion.guidance.behaviours.policy import Policy

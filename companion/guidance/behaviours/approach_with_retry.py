@@ -8,7 +8,6 @@ from typing import Annotated, ClassVar
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.confirmation import DetectionConfirmer
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.command import (
     BuildContext,
@@ -130,7 +129,6 @@ class PersistentApproach(Behaviour):
         self.requirements = self._approach.requirements
         self._tracking, self._field_rad = tracking, field_rad
         self._seek: SeekBehaviour | None = None
-        self._confirmer = DetectionConfirmer((class_name,), confidence)
         self._lost_at: Vector3 | None = None
         self._hold_point: Vector3 = (0.0, 0.0, 0.0)
         self._looking_since_ns: int | None = None
@@ -190,7 +188,6 @@ class PersistentApproach(Behaviour):
             return Outcome(False, self._why + (f"; searched again {times}" if self._tried else ""))
         self._tried += 1
         self.add_notes(f"approach: {self._why}; searching, {self._tried} of {self._retries}")
-        self._confirmer.reset(context.now_ns)
         self._hold_point, _ = position_and_yaw(context.state)
         self._looking_since_ns, self._begun_ns = None, context.now_ns
         return self._look_back(context)
@@ -200,8 +197,9 @@ class PersistentApproach(Behaviour):
         assert self._lost_at is not None
         now_ns = context.now_ns
         position, yaw_rad = position_and_yaw(context.state)
-        if (found := self._confirmer.update(context)) is not None:
-            return self._go_there(context, f"found the {found.class_name} where it was")
+        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        if any(each.certain for each in seen):
+            return self._go_there(context, f"found the {self._class_name} where it was")
         bearing_rad = math.atan2(self._lost_at[1] - position[1], self._lost_at[0] - position[0])
         if (
             self._looking_since_ns is None

@@ -10,8 +10,8 @@ from typing import Annotated, ClassVar
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.confirmation import DetectionConfirmer, YawAligner
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
+from companion.guidance.behaviours.seek import BlindTime, Facing, Standing, range_text
 from companion.guidance.command import (
     BuildContext,
     ClassNames,
@@ -23,14 +23,13 @@ from companion.guidance.command import (
     behaviour,
     names_in,
 )
-from companion.guidance.motion import ground_speed, home_of, position_and_yaw, stay_at
+from companion.guidance.motion import home_of, in_degrees
 from companion.guidance.objects.closing_check import Approached
-from companion.guidance.objects.target import Target
+from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
-# Slower than this the vehicle counts as stopped, and holds.
-STANDING_MPS = 0.4
 # A patrol ends after this time without a frame.
 BLIND_TIMEOUT_S = 10.0
 
@@ -39,9 +38,7 @@ BLIND_TIMEOUT_S = 10.0
 class _Known:
     """An object for which the patrol has stopped."""
 
-    class_name: str
-    track_id: int | None
-    position_ned_m: Vector3 | None
+    object: TrackedObject
     until_ns: float
 
 
@@ -67,7 +64,14 @@ class Patrol(Command):
         float, Number("revisit", "s", 0.0, 3600.0, "time within which the same object is ignored")
     ] = 120.0
     merge_radius_m: Annotated[
-        float, Number("merge_radius", "m", 0.5, 100.0, "detections within this distance are one object")
+        float,
+        Number(
+            "merge_radius",
+            "m",
+            0.5,
+            100.0,
+            "what is within this distance of an object that stopped it is the same",
+        ),
     ] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 3.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
@@ -107,7 +111,7 @@ class Patrol(Command):
 
 
 class PatrolBehaviour(Behaviour):
-    """Flies the closed path; stops for a confirmed object, turns to it and logs its position.
+    """Flies the closed path; stops for an object that is found, turns to it and logs its position.
 
     Args:
         points: (north, east) or (north, east, height) metres from home; a closed path.
@@ -115,7 +119,7 @@ class PatrolBehaviour(Behaviour):
         approach_m: distance to which to approach a find; None: face it from the path.
         dwell_s: time spent at an object.
         revisit_s: an object does not stop the patrol again within this time.
-        merge_radius_m: detections within this distance of an object's position belong to it.
+        merge_radius_m: an object within this distance of one that stopped it is the same.
     """
 
     name = "patrol"
@@ -138,19 +142,19 @@ class PatrolBehaviour(Behaviour):
         if approach_m is not None:
             self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
         self._route = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
-        self._confirmer = DetectionConfirmer(class_names, confidence)
         self._speed_mps, self._confidence = speed_mps, confidence
         self._approach_m, self._dwell_s = approach_m, dwell_s
         self._revisit_s, self._merge_radius_m = revisit_s, merge_radius_m
+        self._begin(0)
+
+    def _begin(self, now_ns: int) -> None:
+        self._begun_ns, self._found = now_ns, 0
         self._known: list[_Known] = []
-        self._aligner: YawAligner | None = None
-        self._reported = False
+        self._facing: Facing | None = None
         self._approach: ApproachBehaviour | None = None
         self._wait_until_ns: float | None = None
-        self._stop: Vector3 | None = None
-        self._down_m = 0.0
-        self._blind_since_ns: int | None = None
-        self._found = 0
+        self._standing: Standing | None = None
+        self._blind = BlindTime(BLIND_TIMEOUT_S)
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
@@ -158,28 +162,28 @@ class PatrolBehaviour(Behaviour):
 
     def on_activate(self, context: BehaviourContext) -> None:
         self._route.on_activate(context)
-        self._confirmer.reset(context.now_ns)
-        self._known.clear()
-        self._aligner = self._approach = self._stop = self._blind_since_ns = self._wait_until_ns = None
-        self._found = 0
+        self._begin(context.now_ns)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        position, yaw_rad = position_and_yaw(context.state)
         if self._approach is not None:
-            return self._fly_there(self._approach, dt_s, context, position)
+            return self._fly_there(self._approach, dt_s, context)
+        if (blind := self._blind.outcome(context)) is not None:
+            return blind
         if not context.perception_fresh:
-            return self._wait_blind(context, position)
-        self._blind_since_ns = None
-        if self._aligner is not None:
-            return self._inspect(self._aligner, context, position, yaw_rad)
-        found = self._confirmer.update(context, lambda target: not self._known_already(target, context))
-        if found is not None:
-            self._aligner, self._reported, self._stop = YawAligner(found, context.now_ns), False, None
-            self._down_m = position[2]
-            return self._stand(context, position, found.bearing_rad)
-        if self._stop is not None:
-            # It stopped while perception was stale.
-            self._resume(context)
+            return self._stand(context)  # so that no part of the path is flown unseen
+        self._known = [known for known in self._known if known.until_ns > context.now_ns]
+        for known in self._known:
+            known.object = context.objects.now(known.object)
+        if self._facing is None:
+            self._facing = self._find(context)
+        if self._facing is not None:
+            return self._inspect(self._facing, context)
+        return self._fly_on(dt_s, context)
+
+    def _fly_on(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if self._standing is not None:
+            self._standing = None
+            self._route.resume(context)
         step = self._route.update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
@@ -194,42 +198,52 @@ class PatrolBehaviour(Behaviour):
     def status(self) -> str:
         if self._approach is not None:
             return f"patrol, approaching a find: {self._approach.status}"
-        if self._aligner is not None:
-            return f"patrol, facing a {self._aligner.target.class_name}"
+        if self._facing is not None:
+            return f"patrol, facing a {self._facing.object.class_name}"
         return self._route.status.replace(self._route.name, "patrol", 1)
 
-    def _inspect(
-        self, aligner: YawAligner, context: BehaviourContext, position: Vector3, yaw_rad: float
-    ) -> BehaviourOutput:
+    def _find(self, context: BehaviourContext) -> Facing | None:
+        for each in context.objects.seen(self.class_names, self._confidence, self._begun_ns):
+            if each.certain and not self._knows(each):
+                return Facing(each, context.now_ns)
+        return None
+
+    def _inspect(self, facing: Facing, context: BehaviourContext) -> BehaviourOutput:
         """Stop, face the object and log it; then approach it, or dwell."""
         now_ns = context.now_ns
-        aligner.follow(self._confirmer.fresh(context))
+        facing.update(context)
         if self._wait_until_ns is not None:
-            self._remember(aligner.target, now_ns)
+            self._remember(facing.object, now_ns)
             if now_ns >= self._wait_until_ns:
                 return self._go_on(context)
-        elif aligner.lost(now_ns):
-            self._note(f"lost a {_named(aligner.target)} before facing it")
-            self._remember(aligner.target, now_ns)
+        elif facing.lost:
+            self._note(f"lost a {_named(facing.object)} before facing it")
+            self._remember(facing.object, now_ns)
             return self._go_on(context)
-        elif aligner.faced(yaw_rad, now_ns):
+        elif facing.faced:
             self._found += 1
-            self._remember(aligner.target, now_ns)
-            self._note(f"found a {_named(aligner.target)}, {self._position_text(aligner.target, context)}")
+            self._remember(facing.object, now_ns)
+            self._note(f"found a {_named(facing.object)}, {_place_text(facing.object, context)}")
             if self._approach_m is not None:
-                self._approach = ApproachBehaviour(
-                    aligner.target.class_name,
-                    distance_m=self._approach_m,
-                    speed_mps=min(self._speed_mps, 3.0),
-                    confidence=min(0.3, self._confidence),
-                )
-                self._approach.on_activate(context)
-                return self._fly_there(self._approach, 0.0, context, position)
+                return self._go_there(facing.object, self._approach_m, context)
             self._wait_until_ns = now_ns + self._dwell_s * 1e9
-        return self._stand(context, position, aligner.target.bearing_rad)
+        return self._stand(context, facing.bearing_rad)
+
+    def _go_there(
+        self, found: TrackedObject, distance_m: float, context: BehaviourContext
+    ) -> BehaviourOutput:
+        self._approach = ApproachBehaviour(
+            found.class_name,
+            distance_m=distance_m,
+            speed_mps=min(self._speed_mps, 3.0),
+            confidence=min(0.3, self._confidence),
+        )
+        self._approach.on_activate(context)
+        context.objects.choose(Subject(found.class_name), found)
+        return self._fly_there(self._approach, 0.0, context)
 
     def _fly_there(
-        self, approach: ApproachBehaviour, dt_s: float, context: BehaviourContext, position: Vector3
+        self, approach: ApproachBehaviour, dt_s: float, context: BehaviourContext
     ) -> BehaviourOutput:
         step = approach.update(dt_s, context)
         if not isinstance(step, Outcome):
@@ -237,82 +251,47 @@ class PatrolBehaviour(Behaviour):
         approach.on_deactivate()
         self._approach = None
         self._note(step.reason)
-        # The object ahead is the one approached: it is still updated while waiting.
-        self._stop, self._wait_until_ns = None, context.now_ns + self._dwell_s * 1e9
-        _, yaw_rad = position_and_yaw(context.state)
-        return self._stand(context, position, yaw_rad)
+        self._standing, self._wait_until_ns = None, context.now_ns + self._dwell_s * 1e9
+        return self._stand(context)
 
-    def _stand(self, context: BehaviourContext, position: Vector3, bearing_rad: float) -> Setpoint:
-        """Brake, hold where the vehicle comes to rest, nose to a bearing."""
-        if self._stop is None and ground_speed(context.state) < STANDING_MPS:
-            self._stop = (position[0], position[1], self._down_m)
-        velocity = (0.0, 0.0, 0.0) if self._stop is None else stay_at(self._stop, position)
-        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
+    def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
+        self._standing = self._standing or Standing(context)
+        return self._standing.setpoint(context, bearing_rad)
 
     def _go_on(self, context: BehaviourContext) -> BehaviourOutput:
-        self._aligner = self._wait_until_ns = None
-        self._confirmer.forget()
-        self._resume(context)
-        return self._route.update(0.0, context)
+        self._facing = self._wait_until_ns = None
+        return self._fly_on(0.0, context)
 
-    def _resume(self, context: BehaviourContext) -> None:
-        self._stop = None
-        self._route.resume(context)
+    def _knows(self, seen: TrackedObject) -> bool:
+        """Whether the patrol stopped for it within `revisit_s`."""
+        known = next((known for known in self._known if self._same(known.object, seen)), None)
+        if known is not None and known.object.last_ns < seen.last_ns:
+            known.object = seen  # it has another id now
+        return known is not None
 
-    def _wait_blind(self, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
-        """Perception is stale: stop, so that no part of the path is flown unseen."""
-        now_ns = context.now_ns
-        if self._blind_since_ns is None:
-            self._blind_since_ns, self._down_m, self._stop = now_ns, position[2], None
-        if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            why = context.perception_fault("no detections received")
-            return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
-        _, yaw_rad = position_and_yaw(context.state)
-        return self._stand(context, position, yaw_rad)
+    def _remember(self, seen: TrackedObject, now_ns: int) -> None:
+        others = [known for known in self._known if not self._same(known.object, seen)]
+        self._known = [*others, _Known(seen, now_ns + self._revisit_s * 1e9)]
 
-    def _known_already(self, target: Target, context: BehaviourContext) -> bool:
-        """Whether the patrol stopped for it within `revisit_s`. Updates the position of a moving object."""
-        self._known = [known for known in self._known if known.until_ns > context.now_ns]
-        for known in self._known:
-            if self._same(known, target):
-                _update(known, target)
-                return True
-        return False
-
-    def _remember(self, target: Target, now_ns: int) -> None:
-        until_ns = now_ns + self._revisit_s * 1e9
-        for known in self._known:
-            if self._same(known, target):
-                _update(known, target)
-                known.until_ns = until_ns
-                return
-        self._known.append(_Known(target.class_name, target.track_id, target.position_ned_m, until_ns))
-
-    def _same(self, known: _Known, target: Target) -> bool:
-        if known.class_name != target.class_name:
-            return False
-        if known.track_id is not None and known.track_id == target.track_id:
+    def _same(self, known: TrackedObject, seen: TrackedObject) -> bool:
+        if known.object_id == seen.object_id:
             return True
-        if known.position_ned_m is None or target.position_ned_m is None:
+        if known.position_ned_m is None or seen.position_ned_m is None:
             return False
-        return math.dist(known.position_ned_m[:2], target.position_ned_m[:2]) <= self._merge_radius_m
-
-    def _position_text(self, target: Target, context: BehaviourContext) -> str:
-        position = target.position_ned_m
-        if position is None:
-            return f"bearing {math.degrees(target.bearing_rad) % 360:.0f}°, range unknown"
-        home = home_of(context.state)
-        north, east = position[0] - home[0], position[1] - home[1]
-        return f"{target.ground_range_m:.1f} m away, {north:.1f} m north and {east:.1f} m east of home"
+        apart_m = math.dist(known.position_ned_m[:2], seen.position_ned_m[:2])
+        return known.class_name == seen.class_name and apart_m <= self._merge_radius_m
 
     def _note(self, text: str) -> None:
         self.add_notes(f"patrol: {text}")
 
 
-def _named(target: Target) -> str:
-    return target.class_name + ("" if target.track_id is None else f" (track {target.track_id})")
+def _named(found: TrackedObject) -> str:
+    return found.class_name + ("" if found.track_id is None else f" (track {found.track_id})")
 
 
-def _update(known: _Known, target: Target) -> None:
-    known.position_ned_m = target.position_ned_m or known.position_ned_m
-    known.track_id = target.track_id if target.track_id is not None else known.track_id
+def _place_text(found: TrackedObject, context: BehaviourContext) -> str:
+    place, home = found.position_ned_m, home_of(context.state)
+    if place is None:
+        return f"bearing {in_degrees(found.detection.bearing_rad)}°, range unknown"
+    north, east = place[0] - home[0], place[1] - home[1]
+    return f"{range_text(found, context)}, {north:.1f} m north and {east:.1f} m east of home"

@@ -1,34 +1,232 @@
-"""Seek: turn on the spot, optionally with a gimbal sweep, then face the best object of a class."""
+"""Seek: turn on the spot, or fly over an area, until an object of a class is found; then face it.
+
+A find is an object that is `certain`. It is verified when the vehicle faces it and still sees it.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import Annotated
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.behaviours.confirmation import (
-    FACING_TIMEOUT_S,
-    SIGHT_FRESH_S,
-    Candidates,
-    DetectionConfirmer,
-    YawAligner,
+from companion.guidance.behaviours.path_flight import PathFlight
+from companion.guidance.command import (
+    BuildContext,
+    ClassName,
+    Command,
+    EnumArgument,
+    GrammarError,
+    Number,
+    behaviour,
 )
-from companion.guidance.gimbal.pitch import GimbalSweep
-from companion.guidance.motion import in_degrees, laps_text, position_and_yaw, stay_at
-from companion.guidance.objects.target import DOUBTED, Target
+from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
+from companion.guidance.motion import ground_speed, in_degrees, laps_text, position_and_yaw, stay_at
+from companion.guidance.objects.target import DOUBTED
+from companion.guidance.objects.tracked_object import FOUND_FRAMES, TrackedObject
+from companion.guidance.path import Path
+from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
-BLIND_TIMEOUT_S = 5.0
-# Time-out of a turn relative to its nominal time, plus the time to face candidates.
-SLOWEST_TURN = 3.0
-# Number of false candidates that the time-out allows for.
-MOST_CANDIDATES = 5
+# Finds whose confidence is within this of the best are equal: the nearest is selected.
+EQUAL_CONFIDENCE = 0.1
+# At a first detection a turn pauses this long for more.
+LOOK_S = 1.0
+# Facing the object: tolerance, duration, time-out, and when it counts as lost.
+FACING_RAD = math.radians(4.0)
+FACING_S = 0.4
+FACING_TIMEOUT_S = 12.0
+SIGHT_LOST_S = 2.0
+# What is faced must have been seen within this time.
+SIGHT_FRESH_S = 0.7
 # Within this angle of nose and gimbal the camera sees the object.
 POINTED_RAD = math.radians(8.0)
+# Slower than this the vehicle counts as stopped, and holds.
+STANDING_MPS = 0.4
+BLIND_TIMEOUT_S = 5.0
+# Time-out of a turn relative to its nominal time, plus the time to face false finds.
+SLOWEST_TURN = 3.0
+MOST_FALSE_FINDS = 5
 # Time-out for returning the gimbal after an unsuccessful sweep.
 BACK_TIMEOUT_S = 5.0
+
+
+@behaviour("seek", "turn, or search an area, until an object of the class is found; then face it")
+class Seek(Command):
+    class_name: Annotated[str, ClassName("class", "what to search for")]
+    laps: Annotated[float, Number("laps", "", 0.25, 20.0, "turns before giving up")] = 2.0
+    rate_radps: Annotated[float, Number("rate", "rad/s", 0.05, 1.0, "how fast to turn")] = 0.5
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.4
+    direction: Annotated[
+        str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
+    ] = "clockwise"
+    pattern: Annotated[
+        str, EnumArgument("pattern", ("turn", "square", "lawnmower"), "on the spot, or over an area about it")
+    ] = "turn"
+    radius_m: Annotated[
+        float | None, Number("radius", "m", 1.0, 500.0, "half a side of the expanding square")
+    ] = None
+    width_m: Annotated[
+        float | None, Number("width", "m", 1.0, 1000.0, "of the lawnmower's area, west to east")
+    ] = None
+    height_m: Annotated[
+        float | None, Number("height", "m", 1.0, 1000.0, "of the lawnmower's area, south to north")
+    ] = None
+    spacing_m: Annotated[
+        float | None,
+        Number("spacing", "m", 1.0, 200.0, "between strips; default: from the camera's footprint"),
+    ] = None
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "over an area, at most")] = 2.0
+    sweep_deg: Annotated[
+        float | None,
+        Number("sweep", "deg", -90.0, 90.0, "gimbal sweep between level and this pitch; below is negative"),
+    ] = None
+    sweep_rate_dps: Annotated[
+        float, Number("sweep_rate", "deg/s", 2.0, 60.0, "of the gimbal; slower also slows the turn")
+    ] = USUAL_RATE_DPS
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sweep_deg is not None and abs(self.sweep_deg) < LEAST_SWEEP_DEG:
+            raise GrammarError(
+                f"seek: sweep must be {LEAST_SWEEP_DEG:g} deg or more from level, got {self.sweep_deg:g}"
+            )
+        if self.sweep_deg is not None and self.pattern != "turn":
+            raise GrammarError(f"seek: pattern={self.pattern} does not use sweep")
+        if self.sweep_deg is None and self.sweep_rate_dps != USUAL_RATE_DPS:
+            raise GrammarError("seek: sweep_rate needs sweep")
+        given = {
+            "radius": self.radius_m,
+            "width": self.width_m,
+            "height": self.height_m,
+            "spacing": self.spacing_m,
+        }
+        needed = {"turn": (), "square": ("radius",), "lawnmower": ("width", "height")}[self.pattern]
+        allowed = (*needed, "spacing") if needed else ()
+        for key, value in given.items():
+            if value is None and key in needed:
+                raise GrammarError(f"seek: pattern={self.pattern} needs {' and '.join(needed)}")
+            if value is not None and key not in allowed:
+                raise GrammarError(f"seek: pattern={self.pattern} does not use {key}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        if self.pattern != "turn":
+            return SearchBehaviour(
+                self.class_name,
+                radius_m=self.radius_m,
+                size_m=None
+                if self.width_m is None or self.height_m is None
+                else (self.width_m, self.height_m),
+                spacing_m=self.spacing_m,
+                footprint=context.footprint,
+                speed_mps=self.speed_mps,
+                confidence=self.confidence,
+            )
+        sweep = None
+        if self.sweep_deg is not None:
+            sweep_rad, rate_radps = math.radians(self.sweep_deg), math.radians(self.sweep_rate_dps)
+            sweep = GimbalSweep(sweep_rad, rate_radps, field_of_view_rad(context.footprint))
+        return SeekBehaviour(
+            self.class_name,
+            laps=self.laps,
+            rate_radps=self.rate_radps,
+            confidence=self.confidence,
+            clockwise=self.direction == "clockwise",
+            whole_turn=True,
+            sweep=sweep,
+        )
+
+
+class Facing:
+    """Turns the nose to an object.
+
+    Attributes:
+        object: as it was seen last without ambiguity.
+        faced: the nose has pointed at it for `FACING_S`, and it is still seen.
+        lost: it is not seen where the camera points, or facing it timed out.
+    """
+
+    def __init__(self, found: TrackedObject, now_ns: int) -> None:
+        self.object = found
+        self.faced = self.lost = False
+        self._begun_ns = now_ns
+        self._pointed = found.unseen_s(now_ns) <= SIGHT_FRESH_S
+        self._expected_ns = found.last_ns
+        self._facing_since_ns: int | None = None
+
+    @property
+    def bearing_rad(self) -> float:
+        """Where to turn the nose."""
+        return self.object.detection.bearing_rad
+
+    def update(self, context: BehaviourContext, pitch_off_rad: float = 0.0) -> None:
+        """Set `object`, `faced` and `lost`. `pitch_off_rad`: between the gimbal and the object."""
+        now_ns = context.now_ns
+        known = context.objects.now(self.object)
+        if not known.ambiguous:
+            self.object = known
+        _, yaw_rad = position_and_yaw(context.state)
+        seen = self.object.detection
+        # At an elevation a difference of bearings is a smaller angle.
+        off_rad = abs(wrap_angle(seen.bearing_rad - yaw_rad)) * math.cos(seen.elevation_rad)
+        if not self._pointed:
+            self._pointed = max(off_rad, pitch_off_rad) <= POINTED_RAD
+            self._expected_ns = now_ns
+        expected_s = (now_ns - max(self.object.last_ns, self._expected_ns)) / 1e9
+        self.lost = expected_s > SIGHT_LOST_S or now_ns - self._begun_ns > FACING_TIMEOUT_S * 1e9
+        if self.object.unseen_s(now_ns) > SIGHT_FRESH_S or off_rad > FACING_RAD:
+            self._facing_since_ns = None
+        elif self._facing_since_ns is None:
+            self._facing_since_ns = now_ns
+        since_ns = self._facing_since_ns
+        self.faced = (
+            since_ns is not None and now_ns - since_ns >= FACING_S * 1e9 and pitch_off_rad <= POINTED_RAD
+        )
+
+
+class Standing:
+    """Brakes, then holds where the vehicle comes to rest, at the height where it began."""
+
+    def __init__(self, context: BehaviourContext) -> None:
+        position, _ = position_and_yaw(context.state)
+        self._down_m = position[2]
+        self._point: Vector3 | None = None
+
+    def setpoint(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
+        """The next setpoint. `bearing_rad`: of the nose; None: unchanged."""
+        position, _ = position_and_yaw(context.state)
+        if self._point is None and ground_speed(context.state) < STANDING_MPS:
+            self._point = (position[0], position[1], self._down_m)
+        velocity = (0.0, 0.0, 0.0) if self._point is None else stay_at(self._point, position)
+        if bearing_rad is None:
+            return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
+
+
+class BlindTime:
+    """How long nothing was seen: a vehicle that stands meanwhile passes nothing unseen."""
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_s = limit_s
+        self._since_ns: int | None = None
+
+    def outcome(self, context: BehaviourContext) -> Outcome | None:
+        """The end of the behaviour, if perception has been stale for the limit."""
+        if context.perception_fresh:
+            self._since_ns = None
+        elif self._since_ns is None:
+            self._since_ns = context.now_ns
+        if self._since_ns is None or context.now_ns - self._since_ns <= self._limit_s * 1e9:
+            return None
+        why = context.perception_fault("no detections received")
+        return Outcome(False, f"{why} for {self._limit_s:g} s")
+
+
+def found_text(found: TrackedObject, context: BehaviourContext) -> str:
+    """A find in words: class, bearing, range."""
+    return f"found a {found.class_name}: bearing {in_degrees(found.detection.bearing_rad)}°, {range_text(found, context)}"
 
 
 class SeekBehaviour(Behaviour):
@@ -56,42 +254,36 @@ class SeekBehaviour(Behaviour):
         sweep: GimbalSweep | None = None,
     ) -> None:
         self._sweep = sweep
-        self._failure = ""
-        self._return_until_ns: float = 0
-        self._begun_ns = 0
         if sweep is not None:
             self.requirements = SeekBehaviour.requirements | {Requirement.GIMBAL}
             self.gimbal_pitches_rad = (0.0, sweep.end_rad)
             rate_radps = min(rate_radps, sweep.turn_rate_radps)
         self.class_names = (class_name,)
-        self._class_name = class_name
-        self._laps = laps
-        self._turn = 1.0 if clockwise else -1.0
-        self._rate_radps = rate_radps
-        self._confirmer = DetectionConfirmer((class_name,), confidence)
-        self._candidates = Candidates()
+        self._class_name, self._confidence = class_name, confidence
+        self._laps, self._rate_radps, self._turn = laps, rate_radps, 1.0 if clockwise else -1.0
         self._compare_at_rad = min(laps, 1.0) * math.tau if whole_turn else 0.0
-        self._compared = False
-        self._point: Vector3 = (0.0, 0.0, 0.0)
-        self._yaw_rad = 0.0
+        self._begin(0, (0.0, 0.0, 0.0), 0.0)
+
+    def _begin(self, now_ns: int, point: Vector3, yaw_rad: float) -> None:
+        self._begun_ns, self._point, self._yaw_rad = now_ns, point, yaw_rad
+        limit_s = (
+            SLOWEST_TURN * self._laps * math.tau / self._rate_radps + MOST_FALSE_FINDS * FACING_TIMEOUT_S
+        )
+        self._give_up_ns = now_ns + limit_s * 1e9
         self._turned_rad = 0.0
-        self._give_up_ns: float = 0
-        self._blind_since_ns: int | None = None
-        self._aligner: YawAligner | None = None
-        self._pointed = False
+        self._compared = self._doubted = False
+        # The table returns an object for some seconds, and a turn may be slower.
+        self._finds: dict[int, TrackedObject] = {}
+        self._facing: Facing | None = None
+        self._seen_ns, self._look_until_ns = 0, 0.0
+        self._blind = BlindTime(BLIND_TIMEOUT_S)
+        self._failure, self._return_until_ns = "", 0.0
 
     def on_activate(self, context: BehaviourContext) -> None:
-        self._point, self._yaw_rad = position_and_yaw(context.state)
-        self._turned_rad = 0.0
-        self._confirmer.reset(context.now_ns)
-        self._candidates, self._compared = Candidates(), False
-        self._aligner = self._blind_since_ns = None
-        self._failure, self._begun_ns = "", context.now_ns
+        self._begin(context.now_ns, *position_and_yaw(context.state))
         gimbal = context.state.gimbal
         if self._sweep is not None and gimbal is not None and gimbal.pitch_rad is not None:
             self._sweep.begin(gimbal.pitch_rad)  # else the first update reports what is missing
-        limit_s = SLOWEST_TURN * self._laps * math.tau / self._rate_radps + MOST_CANDIDATES * FACING_TIMEOUT_S
-        self._give_up_ns = context.now_ns + limit_s * 1e9
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns = context.now_ns
@@ -99,51 +291,75 @@ class SeekBehaviour(Behaviour):
         self._turned_rad += self._turn * wrap_angle(yaw_rad - self._yaw_rad)
         self._yaw_rad = yaw_rad
         stay = stay_at(self._point, position)
+        wait = Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
 
         if self._sweep is not None and (why := self._hindered(self._sweep, context)) is not None:
             return Outcome(False, why)
         if self._failure:
-            return self._look_back(dt_s, context, stay)
+            return self._look_back(dt_s, context) or wait
         if now_ns > self._give_up_ns:
             return Outcome(False, f"seek timed out: {self._turned_rad / math.tau:.1f} laps turned")
+        if (blind := self._blind.outcome(context)) is not None:
+            return blind
         if not context.perception_fresh:
-            return self._wait_blind(context, stay)
-        self._blind_since_ns = None
-        seen = self._confirmer.fresh(context)
-        if self._aligner is not None:
-            self._aligner.follow(seen)
-        else:
-            self._aligner = self._choose(seen, now_ns)
-        if self._aligner is not None:
-            if self._sweep is not None:
-                self._sweep.towards(
-                    _within_reach(self._aligner.target, context), dt_s, _gimbal_pitch(context)
-                )
-            return self._face(self._aligner, context, yaw_rad, stay)
+            return wait  # so that no part of the circle is skipped
+        self._note(context)
+        if self._facing is None and (best := self._best(context)) is not None:
+            self._facing = Facing(best, now_ns)
+        if self._facing is not None:
+            return self._face(self._facing, dt_s, context) or wait
         if abs(self._turned_rad) >= self._laps * math.tau:
-            why = f": {DOUBTED}" if self._confirmer.doubted else ""
+            why = f": {DOUBTED}" if self._doubted else ""
             self._failure = f"no {self._class_name} found in {laps_text(self._laps)}{why}"
             self._return_until_ns = now_ns + BACK_TIMEOUT_S * 1e9
-            return self._look_back(dt_s, context, stay)
-        waiting = now_ns < self._confirmer.look_until_ns
-        if self._sweep is not None and not waiting:
+            return self._look_back(dt_s, context) or wait
+        if now_ns < self._look_until_ns:
+            return wait
+        if self._sweep is not None:
             self._sweep.step(dt_s, _gimbal_pitch(context))
-            waiting = self._sweep.waiting
-        rate = 0.0 if waiting else self._turn * self._rate_radps
-        return Setpoint.velocity(stay, now_ns, yaw_rate_radps=rate)
+            if self._sweep.waiting:
+                return wait
+        return Setpoint.velocity(stay, now_ns, yaw_rate_radps=self._turn * self._rate_radps)
 
-    def _choose(self, seen: list[Target], now_ns: int) -> YawAligner | None:
-        """Process new detections; returns the aligner for the find to face now, if any."""
-        found = self._confirmer.agreed(seen, now_ns)
-        if found:
-            self._confirmer.look_until_ns = now_ns  # the awaited detections have arrived
-        self._candidates.add(seen, found)
+    def _note(self, context: BehaviourContext) -> None:
+        """Note what the newest frame shows, and pause the turn at a first sight."""
+        known = [context.objects.now(each) for each in self._finds.values()]
+        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        self._finds = {each.object_id: each for each in (*known, *(each for each in seen if each.certain))}
+        self._doubted |= any(each.frames >= FOUND_FRAMES and not each.certain for each in seen)
+        if not seen:
+            return
+        if seen[0].last_ns - self._seen_ns > LOOK_S * 1e9:
+            self._look_until_ns = context.now_ns + LOOK_S * 1e9
+        self._seen_ns = seen[0].last_ns
+        if any(each.certain for each in seen):
+            self._look_until_ns = context.now_ns
+
+    def _best(self, context: BehaviourContext) -> TrackedObject | None:
+        """After the turn, the nearest of the finds within `EQUAL_CONFIDENCE` of the highest rank."""
         self._compared = self._compared or abs(self._turned_rad) >= self._compare_at_rad
-        best = self._candidates.best() if self._compared else None
-        if best is None:
+        if not self._compared or not self._finds:
             return None
-        self._pointed = now_ns - best.captured_ns <= SIGHT_FRESH_S * 1e9
-        return YawAligner(best, now_ns)
+        least = max(_rank(each) for each in self._finds.values()) - EQUAL_CONFIDENCE
+        best = [each for each in self._finds.values() if _rank(each) >= least]
+        return min(best, key=lambda each: _range_m(each, context))
+
+    def _face(self, facing: Facing, dt_s: float, context: BehaviourContext) -> BehaviourOutput | None:
+        """Turn nose and gimbal to the find; None: it is lost, and the next best or the turn follows."""
+        pitch_off_rad = 0.0
+        if self._sweep is not None:
+            pitch_rad, goal_rad = _gimbal_pitch(context), _within_reach(facing.object, context)
+            self._sweep.towards(goal_rad, dt_s, pitch_rad)
+            pitch_off_rad = abs(goal_rad - pitch_rad)
+        facing.update(context, pitch_off_rad)
+        if facing.lost:
+            self._facing = None
+            self._finds.pop(facing.object.object_id, None)
+            return None
+        if facing.faced:
+            return Outcome(True, found_text(facing.object, context))
+        stay = stay_at(self._point, position_and_yaw(context.state)[0])
+        return Setpoint.velocity(stay, context.now_ns, yaw_rad=facing.bearing_rad)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
@@ -151,9 +367,9 @@ class SeekBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
-        if self._aligner is not None:
-            return f"facing the {self._class_name} at {in_degrees(self._aligner.target.bearing_rad)}°"
-        seen = f", {len(self._candidates)} found" if len(self._candidates) else ""
+        if self._facing is not None:
+            return f"facing the {self._class_name} at {in_degrees(self._facing.bearing_rad)}°"
+        seen = f", {len(self._finds)} found" if self._finds else ""
         return f"searching for a {self._class_name}, {max(0.0, self._turned_rad) / math.tau:.1f} laps{seen}"
 
     def _hindered(self, sweep: GimbalSweep, context: BehaviourContext) -> str | None:
@@ -170,42 +386,128 @@ class SeekBehaviour(Behaviour):
             return f"seek lost the gimbal: {why}"
         return None if self._failure else sweep.stuck(gimbal.pitch_rad)
 
-    def _look_back(self, dt_s: float, context: BehaviourContext, stay: Vector3) -> BehaviourOutput:
-        """Nothing found: return the gimbal to its initial pitch, then end."""
-        sweep, now_ns = self._sweep, context.now_ns
-        if sweep is None or now_ns > self._return_until_ns or sweep.back(dt_s, _gimbal_pitch(context)):
+    def _look_back(self, dt_s: float, context: BehaviourContext) -> Outcome | None:
+        """Nothing found: return the gimbal to its initial pitch (None), then end."""
+        sweep, late = self._sweep, context.now_ns > self._return_until_ns
+        if sweep is None or late or sweep.back(dt_s, _gimbal_pitch(context)):
             return Outcome(False, self._failure)
-        return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
+        return None
 
-    def _face(
-        self, aligner: YawAligner, context: BehaviourContext, yaw_rad: float, stay: Vector3
-    ) -> BehaviourOutput:
-        now_ns = context.now_ns
-        pitch_off_rad = 0.0
-        if self._sweep is not None:
-            pitch_off_rad = abs(_within_reach(aligner.target, context) - _gimbal_pitch(context))
-        if not self._pointed:
-            self._pointed = max(aligner.off_rad(yaw_rad), pitch_off_rad) <= POINTED_RAD
-            aligner.expect_later(now_ns)
-        if aligner.lost(now_ns):
-            # Face the next best, or continue the turn.
-            self._aligner = None
-            self._candidates.drop(aligner.target)
-            self._confirmer.forget()
-            return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
-        if aligner.faced(yaw_rad, now_ns) and pitch_off_rad <= POINTED_RAD:
-            return Outcome(True, found_text(aligner.target))
-        return Setpoint.velocity(stay, now_ns, yaw_rad=aligner.target.bearing_rad)
 
-    def _wait_blind(self, context: BehaviourContext, stay: Vector3) -> BehaviourOutput:
-        """Perception is stale: stop turning, so that no part of the circle is skipped."""
-        now_ns = context.now_ns
-        if self._blind_since_ns is None:
-            self._blind_since_ns = now_ns
-        if now_ns - self._blind_since_ns > BLIND_TIMEOUT_S * 1e9:
-            why = context.perception_fault("no detections received")
-            return Outcome(False, f"{why} for {BLIND_TIMEOUT_S:g} s")
-        return Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
+class SearchBehaviour(PathFlight):
+    """Flies an expanding square or a lawnmower pattern about its start, nose along the path.
+
+    Args:
+        radius_m: half a side of the expanding square. size_m: (west to east, south to north) of the
+            lawnmower's area. Exactly one of them.
+        spacing_m: between strips; None: from `footprint` at the current height.
+    """
+
+    name = "seek"
+    requirements = SeekBehaviour.requirements
+
+    def __init__(
+        self,
+        class_name: str,
+        *,
+        radius_m: float | None = None,
+        size_m: tuple[float, float] | None = None,
+        spacing_m: float | None = None,
+        footprint: Footprint | None = None,
+        speed_mps: float = 2.0,
+        confidence: float = 0.4,
+    ) -> None:
+        super().__init__(speed_mps)
+        if (radius_m is None) == (size_m is None):
+            raise ValueError("a search needs exactly one of radius_m and size_m")
+        self.class_names = (class_name,)
+        self._class_name, self._confidence = class_name, confidence
+        self._radius_m, self._size_m = radius_m, size_m
+        self._spacing_m, self._footprint = spacing_m, footprint
+        self._begin(0)
+
+    def _begin(self, now_ns: int) -> None:
+        self._begun_ns, self._doubted = now_ns, False
+        self._facing: Facing | None = None
+        self._standing: Standing | None = None
+        self._blind = BlindTime(BLIND_TIMEOUT_S)
+
+    def on_activate(self, context: BehaviourContext) -> None:
+        super().on_activate(context)
+        self._begin(context.now_ns)
+
+    def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if (blind := self._blind.outcome(context)) is not None:
+            return blind
+        if not context.perception_fresh:
+            return self._stand(context)
+        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        self._doubted |= any(each.frames >= FOUND_FRAMES and not each.certain for each in seen)
+        if self._facing is None and (found := [each for each in seen if each.certain]):
+            self._facing = Facing(found[0], context.now_ns)
+        if self._facing is not None:
+            self._facing.update(context)
+            if self._facing.faced:
+                return Outcome(True, found_text(self._facing.object, context))
+            if not self._facing.lost:
+                return self._stand(context, self._facing.bearing_rad)
+            self._facing = None
+        if self._standing is not None:
+            self._standing = None
+            self.resume(context)
+        step = super().update(dt_s, context)
+        if isinstance(step, Outcome) and step.success:
+            why = f": {DOUBTED}" if self._doubted else ""
+            return Outcome(False, f"no {self._class_name} found in the area{why}")
+        return step
+
+    @property
+    def status(self) -> str:
+        if self._facing is not None:
+            return f"facing the {self._class_name}"
+        return f"searching an area for a {self._class_name}{super().status.removeprefix(self.name)}"
+
+    def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
+        self._standing = self._standing or Standing(context)
+        return self._standing.setpoint(context, bearing_rad)
+
+    def _path(self, context: BehaviourContext) -> Path:
+        position, _ = position_and_yaw(context.state)
+        spacing_m = self._spacing_m
+        if spacing_m is None:
+            if self._footprint is None:
+                raise ValueError("camera footprint unknown: set spacing")
+            spacing_m = self._footprint.spacing_m(context.state.altitude_m or 0.0)
+        if self._radius_m is not None:
+            points = expanding_square(self._radius_m, spacing_m)
+        else:
+            assert self._size_m is not None
+            points = lawnmower(*self._size_m, spacing_m)
+        path = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
+        if self._radius_m is not None and len(points) == 1:
+            raise ValueError(f"one strip of {spacing_m:.0f} m covers the area: use pattern=turn")
+        return Path([position, *path], self._speed_mps)
+
+    def _success_text(self) -> str:
+        return "whole area searched"
+
+
+def range_text(found: TrackedObject, context: BehaviourContext) -> str:
+    """How far away an object is, in words."""
+    range_m = _range_m(found, context)
+    return f"{range_m:.1f} m away" if math.isfinite(range_m) else "range unknown"
+
+
+def _range_m(found: TrackedObject, context: BehaviourContext) -> float:
+    """Horizontal, to where it was seen last; infinite where its range is unknown."""
+    position, _ = position_and_yaw(context.state)
+    place = found.position_ned_m
+    return math.inf if place is None else math.dist(place[:2], position[:2])
+
+
+def _rank(found: TrackedObject) -> float:
+    """Its confidence, reduced by the share of ambiguous frames and by a low number of frames."""
+    return found.detection.score * (1.0 - found.doubt) * found.frames / (found.frames + FOUND_FRAMES)
 
 
 def _gimbal_pitch(context: BehaviourContext) -> float:
@@ -216,14 +518,8 @@ def _gimbal_pitch(context: BehaviourContext) -> float:
     return gimbal.pitch_rad
 
 
-def _within_reach(target: Target, context: BehaviourContext) -> float:
-    """The reachable gimbal pitch nearest to a target, radians above the horizon."""
+def _within_reach(found: TrackedObject, context: BehaviourContext) -> float:
+    """The reachable gimbal pitch nearest to an object, radians above the horizon."""
     gimbal = context.state.gimbal
-    pitch_rad = target.elevation_rad - context.gimbal.camera_pitch_rad
+    pitch_rad = found.detection.elevation_rad - context.gimbal.camera_pitch_rad
     return pitch_rad if gimbal is None else gimbal.nearest_pitch_rad(pitch_rad)
-
-
-def found_text(target: Target) -> str:
-    """A find in words: class, bearing, range."""
-    range_text = "range unknown" if target.position_ned_m is None else f"{target.ground_range_m:.1f} m away"
-    return f"found a {target.class_name}: bearing {in_degrees(target.bearing_rad)}°, {range_text}"

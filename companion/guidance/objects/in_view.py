@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import MOST_DOUBT, TrackedObject
 from vision.attitude import wrap_angle
 
 # Candidates are collected for this long from the first confirmed object on, because a detector misses frames.
 CHOOSING_S = 0.4
 # Objects within this angle of the nose count as ahead; of these the nearest one is chosen.
 BEFORE_RAD = math.radians(10.0)
-# An object that is ambiguous in this share of its frames is not chosen.
-MOST_DOUBT = 0.5
 
 
 @dataclass(slots=True)
@@ -99,6 +97,26 @@ class ObjectsInView:
             and each.unseen_s(self.now_ns) <= 2 * CHOOSING_S
             for each in among
         )
+
+    def seen(self, class_names: Collection[str], confidence: float, since_ns: int) -> list[TrackedObject]:
+        """Those in the newest frame, if it was captured after `since_ns`; the highest confidence first."""
+        seen = [
+            each
+            for each in self.objects
+            if each.class_name in class_names
+            and not each.occluded
+            and each.last_ns > since_ns
+            and each.detection.score >= confidence
+        ]
+        return sorted(seen, key=lambda each: -each.detection.score)
+
+    def now(self, known: TrackedObject) -> TrackedObject:
+        """The same object as of its newest detection; unseen for long, it is returned as it is given."""
+        return _same(known, self.objects)
+
+    def choose(self, subject: Subject, chosen: TrackedObject) -> None:
+        """From now on the command means this object."""
+        self._choices[subject] = Choice(chosen)
 
     def forget(self, subject: Subject) -> None:
         """Choose anew."""

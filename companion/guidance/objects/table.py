@@ -73,7 +73,7 @@ class _Object:
         self.first_ns = self.last_ns = target.captured_ns
         self.newest = target
         self.confirmed = target.trusted
-        self._trusted, self._doubted = int(target.trusted), 0
+        self._frames, self._trusted, self._doubted = 1, int(target.trusted), 0
         self.ambiguous = False
         self.filter = None if target.position_ned_m is None else PositionFilter(target, vehicle)
         self.occlusion: _Occlusion | None = None
@@ -108,6 +108,7 @@ class _Object:
         if target.track_id is not None and target.track_id != self.track_id:
             self.track_ids = (*(each for each in self.track_ids if each != target.track_id), target.track_id)
         self.confirmed = self.confirmed or target.trusted
+        self._frames += 1
         self._trusted += target.trusted
         self._doubted += self.confirmed and not target.trusted
         self.ambiguous = ambiguous or not target.trusted
@@ -135,6 +136,7 @@ class _Object:
             self.last_ns,
             self.confirmed,
             self.ambiguous,
+            self._frames,
             self._doubted / max(1, self._doubted + self._trusted),
             occluded,
             self.newest,

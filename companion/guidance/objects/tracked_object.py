@@ -14,6 +14,9 @@ from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
 from vision.geolocation import ErrorEllipse
 
+# An object that is ambiguous in this share of its frames is not chosen; found is one seen in so many frames.
+MOST_DOUBT, FOUND_FRAMES = 0.5, 3
+
 
 @dataclass(frozen=True, slots=True)
 class TrackedObject:
@@ -31,6 +34,7 @@ class TrackedObject:
         first_ns, last_ns: capture of its first and its newest detection.
         confirmed: it may be selected as a goal (`Target.trusted`), in this frame or in one before.
         ambiguous: its newest detection may be of another class, or two detections fit it equally.
+        frames: number of its detections.
         doubt: share of its detections since it was first confirmed in which it was ambiguous, 0..1.
         occluded: it is not in the newest frame.
         detection: its newest detection.
@@ -48,6 +52,7 @@ class TrackedObject:
     last_ns: int
     confirmed: bool
     ambiguous: bool
+    frames: int
     doubt: float
     occluded: bool
     detection: Target
@@ -66,6 +71,12 @@ class TrackedObject:
     def speed_sigma_mps(self) -> float:
         """One sigma of the velocity along the longer axis of its ellipse."""
         return math.sqrt(max(0.0, float(np.linalg.eigvalsh(np.array(self.covariance)[2:, 2:])[-1])))
+
+    @property
+    def certain(self) -> bool:
+        """Whether it counts as found: confirmed, and of its class now and in most of its frames."""
+        sure = self.confirmed and not self.ambiguous and self.doubt < MOST_DOUBT
+        return sure and self.frames >= FOUND_FRAMES
 
     def unseen_s(self, now_ns: int) -> float:
         """How long ago it was detected."""

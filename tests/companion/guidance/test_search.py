@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guidance.behaviours.search import SearchBehaviour
+from companion.guidance.behaviours.seek import SearchBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.objects.target import DOUBTED
