@@ -70,7 +70,7 @@ class Patrol(Command):
             "m",
             0.5,
             100.0,
-            "what is within this distance of an object that stopped it is the same",
+            "detections within this distance are one object",
         ),
     ] = 5.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed")] = 3.0

@@ -226,7 +226,8 @@ class BlindTime:
 
 def found_text(found: TrackedObject, context: BehaviourContext) -> str:
     """A find in words: class, bearing, range."""
-    return f"found a {found.class_name}: bearing {in_degrees(found.detection.bearing_rad)}°, {range_text(found, context)}"
+    bearing = in_degrees(found.detection.bearing_rad)
+    return f"found a {found.class_name}: bearing {bearing}°, {range_text(found, context)}"
 
 
 class SeekBehaviour(Behaviour):
@@ -272,7 +273,7 @@ class SeekBehaviour(Behaviour):
         self._give_up_ns = now_ns + limit_s * 1e9
         self._turned_rad = 0.0
         self._compared = self._doubted = False
-        # The table returns an object for some seconds, and a turn may be slower.
+        # By object id, when it was certain last: a turn takes longer than the table shows an object.
         self._finds: dict[int, TrackedObject] = {}
         self._facing: Facing | None = None
         self._seen_ns, self._look_until_ns = 0, 0.0
@@ -323,16 +324,18 @@ class SeekBehaviour(Behaviour):
 
     def _note(self, context: BehaviourContext) -> None:
         """Note what the newest frame shows, and pause the turn at a first sight."""
-        known = [context.objects.now(each) for each in self._finds.values()]
         seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
-        self._finds = {each.object_id: each for each in (*known, *(each for each in seen if each.certain))}
+        certain = [each for each in seen if each.certain]
+        # Two of them may turn out to be one.
+        finds = (*self._finds.values(), *certain)
+        self._finds = {context.objects.now(each).object_id: each for each in finds}
         self._doubted |= any(each.frames >= FOUND_FRAMES and not each.certain for each in seen)
         if not seen:
             return
         if seen[0].last_ns - self._seen_ns > LOOK_S * 1e9:
             self._look_until_ns = context.now_ns + LOOK_S * 1e9
         self._seen_ns = seen[0].last_ns
-        if any(each.certain for each in seen):
+        if certain:
             self._look_until_ns = context.now_ns
 
     def _best(self, context: BehaviourContext) -> TrackedObject | None:
@@ -354,7 +357,7 @@ class SeekBehaviour(Behaviour):
         facing.update(context, pitch_off_rad)
         if facing.lost:
             self._facing = None
-            self._finds.pop(facing.object.object_id, None)
+            self._finds.pop(context.objects.now(facing.object).object_id, None)
             return None
         if facing.faced:
             return Outcome(True, found_text(facing.object, context))
