@@ -86,6 +86,33 @@ def test_patrol_with_approach_returns_to_its_path() -> None:
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
 
 
+def test_patrol_approaches_the_object_that_it_faced() -> None:
+    """And not the nearer one of its class in that direction, which it knows already."""
+    car = SeenObject("car", 20.0, 9.0, track_id=3)
+    nearer = SeenObject("car", 16.0, 5.0, track_id=4, track_score=0.3)
+    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
+    _, notes, flight = active(behaviour, [car, nearer])
+    assert "found a car (track 3)" in notes[0]
+    assert notes[1].startswith("patrol: reached ")
+    assert nearest(flight, (20.0, 9.0)) == pytest.approx(4.0, abs=0.6)
+
+
+def test_object_with_a_new_id_is_known_by_its_place() -> None:
+    car = SeenObject("car", 6.0, 3.0, track_id=1)
+    small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))
+
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        # Unseen for longer than the table remembers; then it has a new id of the tracker, too.
+        car.visible = not 12.0 < seconds < 90.0
+        car.track_id = 1 if seconds < 90.0 else 2
+
+    behaviour = PatrolBehaviour(small, ["car"], laps=6.0, dwell_s=1.0, revisit_s=600.0)
+    outcome, notes, _ = active(behaviour, [car], 400, each=each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert len(notes) == 1
+
+
 @pytest.mark.parametrize("with_identity", [True, False])
 def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> None:
     small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))

@@ -205,11 +205,49 @@ def test_second_lap_faces_its_first_find_at_once() -> None:
     assert times[-1] < 20.0
 
 
-def test_without_tracking_finds_are_matched_by_bearing() -> None:
-    far = SeenObject("car", 34.0, 12.0)
-    near = SeenObject("car", -15.0, 9.0)
+@pytest.mark.parametrize("with_range", [True, False])
+def test_without_tracking_two_finds_are_told_apart(with_range: bool) -> None:
+    far = SeenObject("car", 34.0, 12.0, confidence=0.5, with_range=with_range)
+    near = SeenObject("car", -15.0, 9.0, with_range=with_range)
     vehicle = KinematicVehicle()
     outcome = Flight(whole_turn(), vehicle, [far, near]).run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert faces(vehicle, near)
+
+
+def test_weak_last_frames_do_not_lower_a_find() -> None:
+    poor = SeenObject("car", 20.0, 6.0, confidence=0.55)
+    good = SeenObject("car", -15.0, 9.0, confidence=0.85)
+    vehicle = KinematicVehicle()
+
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        off_rad = abs(wrap_angle(math.atan2(good.east, good.north) - vehicle.yaw_rad))
+        good.confidence = 0.85 if off_rad < math.radians(30) else 0.3
+
+    outcome = Flight(whole_turn(), vehicle, [poor, good]).run(60.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert faces(vehicle, good)
+
+
+def test_find_with_new_track_ids_is_faced_without_delay() -> None:
+    """The image tracker ends a track that is unseen for 2 s; a sweep's turn is slower than that."""
+    times: list[float] = []
+    seen_s = [0.0]
+    car = SeenObject("car", 12.0, 9.0, track_id=1)
+    vehicle = KinematicVehicle()
+
+    def each(seconds: float, vehicle: KinematicVehicle) -> None:
+        times.append(seconds)
+        if abs(wrap_angle(math.atan2(car.east, car.north) - vehicle.yaw_rad)) < math.radians(40):
+            if seconds - seen_s[0] > 2.0:
+                car.track_id = (car.track_id or 0) + 1
+            seen_s[0] = seconds
+
+    behaviour = SeekBehaviour("car", whole_turn=True, rate_radps=0.25)
+    outcome = Flight(behaviour, vehicle, [car]).run(90.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    assert car.track_id == 2
+    assert times[-1] < math.tau / 0.25 + 3.5
