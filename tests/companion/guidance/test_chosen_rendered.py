@@ -28,8 +28,11 @@ def standing(
 class Flight:
     """In the air, looking north at some objects."""
 
-    def __init__(self, objects: Sequence[SceneObject], seed: int, *, depth: bool) -> None:
+    def __init__(
+        self, objects: Sequence[SceneObject], seed: int, *, depth: bool, tracker: bool = True
+    ) -> None:
         changes = {"detector.image_size": "320", "detector.threads": "1"}
+        changes["tracker.enabled"] = str(tracker).lower()
         settings = camera_settings(CAMERA, MOUNT, changes)
         scene, self.objects = rendered_scene(objects, CAMERA, MOUNT, seed, depth=depth)
         cameras: list[RenderedCamera] = []
@@ -81,6 +84,19 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
     seen.flight.run(4.0)
     assert seen.flight.guidance.busy
     assert seen.range_m(1) == pytest.approx(13.0, abs=0.8)
+
+
+@pytest.mark.parametrize("tracker", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_seek_prefers_a_sure_car_to_a_nearer_truck(tracker: bool) -> None:
+    car, truck = standing("car", -14.0, 9.0, (4.2, 1.8, 1.5)), standing("truck", 2.0, 11.0, (7.0, 2.4, 3.0))
+    seen = Flight([car, truck], 13, depth=False, tracker=tracker)
+    log = seen.flight.fly("seek car", 60.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome.reason
+    (north, east, _), yaw_rad = seen.flight.vehicle.truth.position_ned_m, seen.flight.vehicle.truth.yaw_rad
+    bearing_rad = math.atan2(9.0 - east, -14.0 - north)
+    assert abs(math.remainder(bearing_rad - yaw_rad, math.tau)) < math.radians(5.0)
+    assert log.violations == {}
 
 
 @pytest.mark.parametrize(

@@ -87,14 +87,14 @@ def test_patrol_with_approach_returns_to_its_path() -> None:
 
 
 def test_patrol_approaches_the_object_that_it_faced() -> None:
-    """And not the nearer one of its class in that direction, which it knows already."""
-    car = SeenObject("car", 20.0, 9.0, track_id=3)
-    nearer = SeenObject("car", 16.0, 5.0, track_id=4, track_score=0.3)
+    """And not the nearer one in that direction, which is not confident enough to be found."""
+    car = SeenObject("car", 16.0, 9.0, track_id=3)
+    nearer = SeenObject("car", 10.5, 5.7, track_id=4, track_score=0.3)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
     _, notes, flight = active(behaviour, [car, nearer])
     assert "found a car (track 3)" in notes[0]
     assert notes[1].startswith("patrol: reached ")
-    assert nearest(flight, (20.0, 9.0)) == pytest.approx(4.0, abs=0.6)
+    assert nearest(flight, (16.0, 9.0)) == pytest.approx(4.0, abs=0.6)
 
 
 def test_object_with_a_new_id_is_known_by_its_place() -> None:
