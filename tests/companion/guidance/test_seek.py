@@ -206,7 +206,7 @@ def test_second_lap_faces_its_first_find_at_once() -> None:
 
 
 @pytest.mark.parametrize("with_range", [True, False])
-def test_without_tracking_two_finds_are_told_apart(with_range: bool) -> None:
+def test_without_tracking_two_finds_are_distinguished(with_range: bool) -> None:
     far = SeenObject("car", 34.0, 12.0, confidence=0.5, with_range=with_range)
     near = SeenObject("car", -15.0, 9.0, with_range=with_range)
     vehicle = KinematicVehicle()
