@@ -3,7 +3,6 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
-from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
@@ -20,8 +19,8 @@ def active(
     seconds: float = 240.0,
     each: Callable[[float, KinematicVehicle], None] = lambda seconds, vehicle: None,
     vehicle: KinematicVehicle | None = None,
-) -> tuple[Outcome | None, list[str], Flight]:
-    """(outcome, notes, flight)."""
+) -> tuple[str, list[str], Flight]:
+    """(reason of the success, notes, flight)."""
     notes: list[str] = []
 
     def listen(at: float, vehicle: KinematicVehicle) -> None:
@@ -30,7 +29,9 @@ def active(
 
     flight = Flight(behaviour, vehicle or KinematicVehicle(), objects)
     outcome = flight.run(seconds, listen)
-    return outcome, [*notes, *behaviour.take_notes()], flight
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    return outcome.reason, [*notes, *behaviour.take_notes()], flight
 
 
 def nearest(flight: Flight, point: Sequence[float]) -> float:
@@ -39,10 +40,8 @@ def nearest(flight: Flight, point: Sequence[float]) -> float:
 
 def test_other_class_and_unconfirmed_target_do_not_stop_its_lap() -> None:
     objects = [SeenObject("person", 10, 3), SeenObject("car", 15.0, 4.0, trusted=False)]
-    outcome, notes, flight = active(PatrolBehaviour(ROUND, ["car"], laps=1.0), objects)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
-    assert outcome.reason.endswith("1 lap of 4 points flown, 0 stops")
+    reason, notes, flight = active(PatrolBehaviour(ROUND, ["car"], laps=1.0), objects)
+    assert reason.endswith("1 lap of 4 points flown, 0 stops")
     assert notes == []
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
 
@@ -56,10 +55,8 @@ def test_patrol_stops_faces_reports_and_continues() -> None:
         if "facing" in behaviour.status and math.hypot(*vehicle.velocity) < 0.1:
             standing.append((tuple(vehicle.position), vehicle.yaw_rad))
 
-    outcome, notes, flight = active(behaviour, [car], each=each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
-    assert outcome.reason.endswith("1 stop")
+    reason, notes, flight = active(behaviour, [car], each=each)
+    assert reason.endswith("1 stop")
     assert len(notes) == 1
     assert notes[0].startswith("patrol: found a car (track 7)")
     assert "18.0 m north and 6.0 m east" in notes[0]
@@ -76,9 +73,7 @@ def test_patrol_stops_faces_reports_and_continues() -> None:
 def test_patrol_with_approach_returns_to_its_path() -> None:
     car = SeenObject("car", 16.0, 9.0, track_id=3)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
-    outcome, notes, flight = active(behaviour, [car])
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, flight = active(behaviour, [car])
     assert notes[1].startswith("patrol: reached ")
     assert "reached car" in notes[1]
     assert len(notes) == 2
@@ -107,9 +102,7 @@ def test_object_with_a_new_id_is_known_by_its_place() -> None:
         car.track_id = 1 if seconds < 90.0 else 2
 
     behaviour = PatrolBehaviour(small, ["car"], laps=6.0, dwell_s=1.0, revisit_s=600.0)
-    outcome, notes, _ = active(behaviour, [car], 400, each=each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, _ = active(behaviour, [car], 400, each=each)
     assert len(notes) == 1
 
 
@@ -117,25 +110,17 @@ def test_object_with_a_new_id_is_known_by_its_place() -> None:
 def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> None:
     small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))
     car = SeenObject("car", 6.0, 3.0, track_id=7 if with_identity else None)
-    outcome, notes, _ = active(
-        PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400
-    )
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, _ = active(PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400)
     assert len(notes) == 1
     behaviour = PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=10.0)
-    outcome, notes, _ = active(behaviour, [car], 400)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, _ = active(behaviour, [car], 400)
     assert len(notes) >= 2
 
 
 def test_two_objects_stop_it_once_each() -> None:
     cars = [SeenObject("car", 15.0, 4.0, track_id=1), SeenObject("car", 20.0, 16.0, track_id=2)]
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, dwell_s=1.0)
-    outcome, notes, _ = active(behaviour, cars)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, _ = active(behaviour, cars)
     assert sorted(note.split("(")[1][:7] for note in notes) == ["track 1", "track 2"]
 
 
@@ -147,9 +132,7 @@ def test_object_lost_before_facing_is_logged() -> None:
         if "facing" in behaviour.status:
             car.visible = False
 
-    outcome, notes, _ = active(behaviour, [car], each=each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    _, notes, _ = active(behaviour, [car], each=each)
     assert ["track 9" in note for note in notes] == [True]
 
 

@@ -1,13 +1,24 @@
 import math
+from collections.abc import Callable
 
 import pytest
 
+from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle
+
+
+def found(
+    flight: Flight, each: Callable[[float, KinematicVehicle], None] = lambda seconds, vehicle: None
+) -> Outcome:
+    outcome = flight.run(90.0, each)
+    assert outcome is not None
+    assert outcome.success, outcome.reason
+    return outcome
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 179, 200, 300, 355])
@@ -15,9 +26,7 @@ def test_seek_finds_and_faces_an_object(degrees: float) -> None:
     angle = math.radians(degrees)
     car = SeenObject("car", 12.0 * math.cos(angle), 12.0 * math.sin(angle))
     vehicle = KinematicVehicle()
-    outcome = Flight(SeekBehaviour("car"), vehicle, [car]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = found(Flight(SeekBehaviour("car"), vehicle, [car]))
     assert abs(wrap_angle(angle - vehicle.yaw_rad)) < math.radians(5)
     assert "12.0 m" in outcome.reason
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.2
@@ -31,10 +40,8 @@ def test_seek_gives_up_after_its_laps() -> None:
         turned[0] += wrap_angle(vehicle.yaw_rad - turned[1])
         turned[1] = vehicle.yaw_rad
 
-    outcome = Flight(SeekBehaviour("car"), vehicle, [SeenObject("person", 5.0, 5.0)]).run(90.0, each)
-    assert outcome is not None
-    assert not outcome.success
-    assert "2 laps" in outcome.reason
+    flight = Flight(SeekBehaviour("car"), vehicle, [SeenObject("person", 5.0, 5.0)])
+    assert_failed(flight.run(90.0, each), "2 laps")
     assert turned[0] / math.tau == pytest.approx(2.0, abs=0.02)
 
 
@@ -65,16 +72,12 @@ def test_turn_continues_when_the_find_disappears() -> None:
             in_view_since.append(seconds)
             car.visible = seconds - in_view_since[0] < 0.5
 
-    outcome = flight.run(90.0, each)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(flight.run(90.0, each))
 
 
 def test_low_confidence_detections_do_not_count() -> None:
     weak = SeenObject("car", 10.0, 0.0, confidence=0.3)
-    outcome = Flight(SeekBehaviour("car", laps=0.5), objects=[weak]).run(60.0)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(Flight(SeekBehaviour("car", laps=0.5), objects=[weak]).run(60.0))
 
 
 def test_silent_detector_stops_then_ends_the_turn() -> None:
@@ -83,10 +86,7 @@ def test_silent_detector_stops_then_ends_the_turn() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
 
-    outcome = flight.run(60.0, each)
-    assert outcome is not None
-    assert not outcome.success
-    assert "no detections" in outcome.reason
+    assert_failed(flight.run(60.0, each), "no detections")
     assert abs(flight.vehicle.yaw_rate_radps) < 0.01
 
 
@@ -107,9 +107,7 @@ def test_command_compares_the_finds_of_a_whole_turn() -> None:
     first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
     surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
     vehicle = KinematicVehicle()
-    outcome = Flight(parse("seek car").build(NO_CONTEXT), vehicle, [first, surer]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(parse("seek car").build(NO_CONTEXT), vehicle, [first, surer]))
     assert faces(vehicle, surer)
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.3
 
@@ -126,9 +124,7 @@ def test_nearest_of_equally_confident_finds_is_faced() -> None:
     far = SeenObject("car", 34.0, 12.0, track_id=1, track_score=0.85)
     near = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.8)
     vehicle = KinematicVehicle()
-    outcome = Flight(whole_turn(), vehicle, [far, near]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(), vehicle, [far, near]))
     assert faces(vehicle, near)
 
 
@@ -149,9 +145,7 @@ def test_often_ambiguous_find_ranks_lower() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         doubted.trusted = int(seconds * 10) % 3 != 0
 
-    outcome = Flight(whole_turn(), vehicle, [doubted, clear]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(), vehicle, [doubted, clear]), each)
     assert faces(vehicle, clear)
 
 
@@ -163,9 +157,7 @@ def test_next_best_is_faced_when_the_best_is_gone() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         best.visible = seconds < 6.0
 
-    outcome = Flight(whole_turn(laps=1.0), vehicle, [best, other]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(laps=1.0), vehicle, [best, other]), each)
     assert faces(vehicle, other)
 
 
@@ -175,18 +167,14 @@ def test_find_that_becomes_ambiguous_is_not_verified() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.trusted = seconds < 8.0
 
-    outcome = Flight(whole_turn(laps=1.0), objects=[car]).run(90.0, each)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(Flight(whole_turn(laps=1.0), objects=[car]).run(90.0, each))
 
 
 def test_partial_turn_compares_its_finds() -> None:
     beyond = SeenObject("car", 0.0, -15.0, track_id=1, track_score=0.9)
     within = SeenObject("car", 0.0, 15.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
-    outcome = Flight(whole_turn(laps=0.5), vehicle, [beyond, within]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(laps=0.5), vehicle, [beyond, within]))
     assert faces(vehicle, within)
 
 
@@ -199,9 +187,7 @@ def test_second_lap_faces_its_first_find_at_once() -> None:
         times.append(seconds)
         late.visible = seconds > 8.0
 
-    outcome = Flight(whole_turn(), vehicle, [late]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(), vehicle, [late]), each)
     assert times[-1] < 20.0
 
 
@@ -210,9 +196,7 @@ def test_without_tracking_two_finds_are_distinguished(with_range: bool) -> None:
     far = SeenObject("car", 34.0, 12.0, confidence=0.5, with_range=with_range)
     near = SeenObject("car", -15.0, 9.0, with_range=with_range)
     vehicle = KinematicVehicle()
-    outcome = Flight(whole_turn(), vehicle, [far, near]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(), vehicle, [far, near]))
     assert faces(vehicle, near)
 
 
@@ -225,9 +209,7 @@ def test_weak_last_frames_do_not_lower_a_find() -> None:
         off_rad = abs(wrap_angle(math.atan2(good.east, good.north) - vehicle.yaw_rad))
         good.confidence = 0.85 if off_rad < math.radians(30) else 0.3
 
-    outcome = Flight(whole_turn(), vehicle, [poor, good]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(whole_turn(), vehicle, [poor, good]), each)
     assert faces(vehicle, good)
 
 
@@ -246,8 +228,6 @@ def test_find_with_new_track_ids_is_faced_without_delay() -> None:
             seen_s[0] = seconds
 
     behaviour = SeekBehaviour("car", whole_turn=True, rate_radps=0.25)
-    outcome = Flight(behaviour, vehicle, [car]).run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    found(Flight(behaviour, vehicle, [car]), each)
     assert car.track_id == 2
     assert times[-1] < math.tau / 0.25 + 3.5
