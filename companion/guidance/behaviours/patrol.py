@@ -11,7 +11,7 @@ from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.seek import BlindTime, Facing, Standing, range_text
+from companion.guidance.behaviours.seek import BlindTime, Facing, Standing, range_m, range_text
 from companion.guidance.command import (
     BuildContext,
     ClassNames,
@@ -203,10 +203,12 @@ class PatrolBehaviour(Behaviour):
         return self._route.status.replace(self._route.name, "patrol", 1)
 
     def _find(self, context: BehaviourContext) -> Facing | None:
-        for each in context.objects.seen(self.class_names, self._confidence, self._begun_ns):
-            if each.certain and not self._knows(each):
-                return Facing(each, context.now_ns)
-        return None
+        """The nearest find, if it has not been stopped for yet."""
+        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        finds = [each for each in seen if each.certain and not self._knows(each)]
+        if not finds:
+            return None
+        return Facing(min(finds, key=lambda each: range_m(each, context)), context.now_ns)
 
     def _inspect(self, facing: Facing, context: BehaviourContext) -> BehaviourOutput:
         """Stop, face the object and log it; then approach it, or dwell."""

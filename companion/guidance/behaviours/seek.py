@@ -345,7 +345,7 @@ class SeekBehaviour(Behaviour):
             return None
         least = max(_rank(each) for each in self._finds.values()) - EQUAL_CONFIDENCE
         best = [each for each in self._finds.values() if _rank(each) >= least]
-        return min(best, key=lambda each: _range_m(each, context))
+        return min(best, key=lambda each: range_m(each, context))
 
     def _face(self, facing: Facing, dt_s: float, context: BehaviourContext) -> BehaviourOutput | None:
         """Turn nose and gimbal to the find; None: it is lost, and the next best or the turn follows."""
@@ -497,11 +497,11 @@ class SearchBehaviour(PathFlight):
 
 def range_text(found: TrackedObject, context: BehaviourContext) -> str:
     """How far away an object is, in words."""
-    range_m = _range_m(found, context)
-    return f"{range_m:.1f} m away" if math.isfinite(range_m) else "range unknown"
+    away_m = range_m(found, context)
+    return f"{away_m:.1f} m away" if math.isfinite(away_m) else "range unknown"
 
 
-def _range_m(found: TrackedObject, context: BehaviourContext) -> float:
+def range_m(found: TrackedObject, context: BehaviourContext) -> float:
     """Horizontal, to where it was seen last; infinite where its range is unknown."""
     position, _ = position_and_yaw(context.state)
     place = found.position_ned_m

@@ -117,11 +117,12 @@ def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> N
     assert len(notes) >= 2
 
 
-def test_two_objects_stop_it_once_each() -> None:
-    cars = [SeenObject("car", 15.0, 4.0, track_id=1), SeenObject("car", 20.0, 16.0, track_id=2)]
+def test_two_objects_stop_it_once_each_the_nearer_first() -> None:
+    far = SeenObject("car", 20.0, 11.0, track_id=1, track_score=0.9)
+    near = SeenObject("car", 15.0, 4.0, track_id=2, track_score=0.6)
     behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, dwell_s=1.0)
-    _, notes, _ = active(behaviour, cars)
-    assert sorted(note.split("(")[1][:7] for note in notes) == ["track 1", "track 2"]
+    _, notes, _ = active(behaviour, [far, near])
+    assert [note.split("(")[1][:7] for note in notes] == ["track 2", "track 1"]
 
 
 def test_object_lost_before_facing_is_logged() -> None:
