@@ -2,7 +2,8 @@
 
 The followed car goes to and fro across the line of sight, at up to 2.5 m/s; the other one does the same 6 m
 nearer to the camera or 6 m behind it, so that they cross four times or more in a minute. Low and 12 m away,
-the nearer one hides most of the other, for up to 4 s. The camera is level and stabilized; range comes from the ground plane.
+the nearer one hides most of the other, for up to 4 s. The camera is stabilized, 10° below the horizon; range
+comes from the ground plane.
 
 A flight succeeds if at its end the vehicle follows the car that it began with. `flown_to_other` is 1 where
 it followed the other one, with no word: neither lost nor ambiguous.

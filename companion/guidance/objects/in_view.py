@@ -119,7 +119,7 @@ class ObjectsInView:
         self._choices[subject] = Choice(chosen)
 
     def forget(self, subject: Subject) -> None:
-        """Choose anew."""
+        """Choose again."""
         self._choices.pop(subject, None)
 
 

@@ -1,8 +1,8 @@
-"""The objects that one camera shows: detections are told apart, associated and filtered once, here.
+"""The objects that one camera shows: detections are associated and filtered once, here.
 
 The image tracker's ids have priority. An object whose id ends is predicted; a detection with an id that is
 new since then may be the object, if it is near where the object is expected and no other detection fits about
-as well. What was seen beside an object is another one for ever. After an occlusion the association is a
+as well. What was seen beside an object is never the same one. After an occlusion the association is a
 hypothesis for a while: if another detection then fits the prediction far better, the two are exchanged.
 """
 
@@ -337,9 +337,9 @@ class _Frame:
             if known.object_id in self._seen or known.filter is None:
                 continue
             fits = self._fitting(known)
-            # Without a tracker nothing but the distance tells them apart.
-            told_apart = [fit for fit in fits if fit.target.track_id is not None]
-            known.ambiguous = len(told_apart) > 1 and _alike(fits[0], fits[1])
+            # Without a tracker only the distance distinguishes them.
+            with_ids = [fit for fit in fits if fit.target.track_id is not None]
+            known.ambiguous = len(with_ids) > 1 and _alike(fits[0], fits[1])
             if fits and not known.ambiguous:
                 chosen.setdefault(id(fits[0].target), []).append((known, fits[0]))
         for pairs in chosen.values():
