@@ -24,14 +24,14 @@ class PoseSharing:
 
     Attributes:
         vehicle: its name. source: random identifier of this run of the service.
-        heard: a pose of another vehicle was received, at any time.
+        received: a pose of another vehicle was received, at any time.
     """
 
     def __init__(self, vehicle: str, on_event: Callable[[str, str], None]) -> None:
         self.vehicle, self._on_event = vehicle, on_event
         self.source = uuid.uuid4().hex[:12]
         self._neighbours = Neighbours(vehicle, self.source)
-        self._valid_from_ns, self.heard = 0, False
+        self._valid_from_ns, self.received = 0, False
 
     def discard_received(self, now_ns: int) -> None:
         """What was received until now is outdated, also where it is processed later."""
@@ -49,7 +49,7 @@ class PoseSharing:
 
     def ingest(self, pose: Pose, receipt_ns: int) -> None:
         """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds."""
-        self.heard = self.heard or pose.source != self.source
+        self.received = self.received or pose.source != self.source
         namesakes = len(self._neighbours.namesakes)
         self._neighbours.ingest(pose, receipt_ns)
         if len(self._neighbours.namesakes) > namesakes:

@@ -23,14 +23,14 @@ class VelocitySenders:
     """The programs that send velocities. Stamps are CLOCK_MONOTONIC nanoseconds.
 
     Attributes:
-        heard: a message was accepted, at any time.
+        received: a message was accepted, at any time.
     """
 
     def __init__(self) -> None:
         self._newest: dict[str, VelocityInput] = {}
         self._delays: dict[str, SenderDelay] = {}
         self._stamps_ns: dict[str, int] = {}
-        self._valid_from_ns, self.heard = 0, False
+        self._valid_from_ns, self.received = 0, False
 
     def discard_received(self, now_ns: int) -> None:
         """What was received until now is outdated, also where it is processed later."""
@@ -62,7 +62,7 @@ class VelocitySenders:
                 f"{source}: stamp_ns is {older_ns / 1e9:.3f} s older than the newest; "
                 f"a restarted sender needs a new source, or {FORGET_S:g} s"
             )
-        self._stamps_ns[source], self.heard = body["stamp_ns"], True
+        self._stamps_ns[source], self.received = body["stamp_ns"], True
         late_ns = self._delays.setdefault(source, SenderDelay()).update(body["stamp_ns"], receipt_ns)
         lifetime_ns = round(body.get("lifetime_s", MAX_LIFETIME_S) * 1e9)
         self._newest[source] = VelocityInput(

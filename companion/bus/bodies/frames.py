@@ -67,7 +67,7 @@ class ObjectBody(TypedDict):
     """One object as guidance has it at this frame, its numbers not rounded; null where unknown."""
 
     object_id: int
-    """constant while the image tracker changes its ids; of one camera, begins again when its images do"""
+    """constant while the image tracker changes its ids; of one camera, from 1 again after a standstill"""
     track_ids: list[int]
     """the track ids that it had, the newest last; empty without a tracker"""
     class_name: str

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from companion.dashboard.merge import Sighting, merged
@@ -35,7 +37,7 @@ def test_near_tracks_of_two_vehicles_are_one_object() -> None:
 
 
 def test_gate_has_the_shape_of_the_errors() -> None:
-    long = {"sigma_m": 3.0, "east_sigma_m": 0.3}
+    long: dict[str, Any] = {"sigma_m": 3.0, "east_sigma_m": 0.3}
     assert len(groups(seen("a", 1, 0.0), seen("b", 5, 8.0, 0.0, **long))) == 1
     assert len(groups(seen("a", 1, 0.0), seen("b", 5, 0.0, 8.0, **long))) == 2
 
