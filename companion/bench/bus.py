@@ -356,6 +356,7 @@ def _detections(sequence: int) -> DetectionsBody:
         "ambiguous": False,
         "doubt": 0.0,
         "occluded": False,
+        "frames": 36,
     }
     return {
         "vehicle": VEHICLE,

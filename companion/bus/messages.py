@@ -202,6 +202,7 @@ def _object(each: TrackedObject, origin: GeodeticOrigin | None) -> ObjectBody:
         "ambiguous": each.ambiguous,
         "doubt": each.doubt,
         "occluded": each.occluded,
+        "frames": each.frames,
     }
 
 

@@ -100,6 +100,8 @@ class ObjectBody(TypedDict):
     """share of its detections since its confirmation in which it was ambiguous, 0 to 1"""
     occluded: bool
     """it is not in this frame"""
+    frames: int
+    """number of its detections"""
 
 
 class DetectionBody(PositionBody):
