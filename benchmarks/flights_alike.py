@@ -68,7 +68,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         off_m = [math.dist(place, _place(item, moment.seconds)) for item in (chosen, other)]
         followed.append((off_m[0], off_m[1], seen.ambiguous or seen.occluded))
 
-    behaviour = FollowBehaviour("car", distance_m=DISTANCE_M, occlusion_s=OCCLUSION_S)
+    behaviour = FollowBehaviour(Subject("car"), distance_m=DISTANCE_M, occlusion_s=OCCLUSION_S)
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
     if not followed:
         return FlightResult(seed, False, {"flown_to_other": 0.0}, "nothing was chosen")

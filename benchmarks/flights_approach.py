@@ -20,6 +20,7 @@ from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.objects.subject import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 
@@ -48,7 +49,9 @@ def fly(
     with_depth: bool,
     tolerance_m: float,
     rendered: bool = False,
-    command: Callable[[str], str | Behaviour] = lambda name: ApproachBehaviour(name, distance_m=DISTANCE_M),
+    command: Callable[[str], str | Behaviour] = lambda name: ApproachBehaviour(
+        Subject(name), distance_m=DISTANCE_M
+    ),
 ) -> FlightResult:
     """One flight; its success allows an error of the final range of `tolerance_m`.
 

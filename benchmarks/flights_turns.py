@@ -19,6 +19,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.objects.subject import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 
 DISTANCE_M, HEIGHT_M = 10.0, 4.0
@@ -56,7 +57,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         if moment.seconds >= SETTLING_S:
             errors_m.append(abs(goal.range_m(moment.truth.position_ned_m, moment.seconds) - DISTANCE_M))
 
-    log = flight.fly(FollowBehaviour(class_name, distance_m=DISTANCE_M), FLIGHT_S, each=judge)
+    log = flight.fly(FollowBehaviour(Subject(class_name), distance_m=DISTANCE_M), FLIGHT_S, each=judge)
     if log.outcome is None:
         reason = "followed to the end"
     else:

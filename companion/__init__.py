@@ -32,6 +32,9 @@ if TYPE_CHECKING:
         Number,
         behaviour,
     )
+    from companion.guidance.objects.subject import Subject
+    from companion.guidance.objects.table import ObjectTable
+    from companion.guidance.objects.tracked_object import TrackedObject
     from companion.service import Service
     from companion.settings import Settings
     from companion.vehicle.setpoint import Setpoint
@@ -52,6 +55,9 @@ _MODULES = {
         "Number",
         "behaviour",
     ),
+    "companion.guidance.objects.subject": ("Subject",),
+    "companion.guidance.objects.table": ("ObjectTable",),
+    "companion.guidance.objects.tracked_object": ("TrackedObject",),
     "companion.client": ("connect",),
     "companion.service": ("Service",),
     "companion.settings": ("Settings",),
@@ -68,11 +74,14 @@ __all__ = [
     "EnumArgument",
     "ModeRequest",
     "Number",
+    "ObjectTable",
     "Outcome",
     "Requirement",
     "Service",
     "Setpoint",
     "Settings",
+    "Subject",
+    "TrackedObject",
     "__version__",
     "behaviour",
     "connect",

@@ -65,7 +65,7 @@ COMPANION_LAYERS = {
 GUIDANCE_LAYERS = {
     "motion": 0,
     "search_pattern": 0,
-    "objects": 0,
+    "objects": 1,
     "path": 1,
     "policy_network": 0,
     "policy_file": 1,

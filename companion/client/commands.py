@@ -146,13 +146,13 @@ class Commands(ABC):
         """Circle, nose to the centre: the point `radius` ahead, an object of a class, a track or a marker.
 
         Args:
-            class_: object to circle about, optional
+            class_: an object of this class
             radius: of the circle (1 to 100 m; default 10)
             speed: along the circle (0.1 to 10 m/s; default 2)
             laps: how many; 0: until another command (0 to 100; default 0)
             direction: seen from above (default clockwise)
-            track: circle about this track's object, instead of a class
-            marker: circle about this marker, instead of a class
+            track: the object of this track
+            marker: this printed marker
         """
         return await self._run(
             "orbit",
@@ -230,7 +230,7 @@ class Commands(ABC):
         """Fly to an object of the class, a track or a marker, keeping the height, and stop before it.
 
         Args:
-            class_: what to fly to
+            class_: an object of this class
             distance: where to stop, over ground to its nearest surface (1 to 100 m; default 5)
             speed: maximum speed (0.2 to 10 m/s; default 2)
             confidence: minimum confidence (0.05 to 1; default 0.3)
@@ -238,8 +238,8 @@ class Commands(ABC):
             retries: how often to search for a lost object, unless it is a track or a marker (0 to 20; default
                 2)
             gimbal: leave: not moved; track: camera kept on the object (default leave)
-            track: fly to this track, instead of a class
-            marker: fly to this marker, instead of a class
+            track: the object of this track
+            marker: this printed marker
         """
         return await self._run(
             "approach",
@@ -271,7 +271,7 @@ class Commands(ABC):
         """Keep a distance and a bearing to a moving object of the class, a track or a marker.
 
         Args:
-            class_: what to follow
+            class_: an object of this class
             distance: to keep, over ground to its nearest surface (1.5 to 100 m; default 8)
             bearing: where to stay: unchanged, or `angle` from north or course (default here)
             angle: seen from the object, clockwise; relative to its course 180 is behind (-360 to 360 deg;
@@ -281,8 +281,8 @@ class Commands(ABC):
             occlusion: follow a hidden object's predicted path this long (0.5 to 60 s; default 3)
             duration: how long; 0: until another command (0 to 3600 s; default 0)
             gimbal: leave: not moved; track: camera kept on the object (default leave)
-            track: follow this track, instead of a class
-            marker: follow this marker, instead of a class
+            track: the object of this track
+            marker: this printed marker
         """
         return await self._run(
             "follow",
@@ -306,18 +306,20 @@ class Commands(ABC):
         distance: float | None = None,
         limit: float | None = None,
         track: int | None = None,
+        marker: int | None = None,
     ) -> Reply:
         """Fly to an object by a trained policy and stop before it.
 
         Args:
             file: an ONNX file on the service's computer, or a bundled policy
-            class_: what to fly to
+            class_: an object of this class
             distance: where to stop, over ground to its nearest surface (1 to 100 m; default 5)
             limit: give up after this long (1 to 3600 s; default 120)
-            track: fly to this track, instead of a class
+            track: the object of this track
+            marker: this printed marker
         """
         return await self._run(
-            "policy", file=file, class_=class_, distance=distance, limit=limit, track=track
+            "policy", file=file, class_=class_, distance=distance, limit=limit, track=track, marker=marker
         )
 
     async def patrol(
@@ -437,11 +439,12 @@ class Commands(ABC):
         self,
         pitch: float | None = None,
         yaw: float | None = None,
-        track: int | None = None,
         class_: str | None = None,
         latitude: float | None = None,
         longitude: float | None = None,
         altitude: float | None = None,
+        track: int | None = None,
+        marker: int | None = None,
     ) -> Reply:
         """Point the gimbal during any behaviour, or keep it on an object or a place; default: level and
         ahead.
@@ -449,21 +452,23 @@ class Commands(ABC):
         Args:
             pitch: above the horizon; below is negative (-90 to 90 deg; default 0)
             yaw: clockwise from the nose (-180 to 180 deg; default 0)
-            track: keep it on this track until it is lost, instead of pitch and yaw
-            class_: keep it on the best object of this class, until none is seen
+            class_: an object of this class
             latitude: of a place to keep it on, WGS 84; needs longitude (-90 to 90 deg)
             longitude: WGS 84; needs latitude (-180 to 180 deg)
             altitude: of the place above home; default: 0 (-500 to 5000 m)
+            track: the object of this track
+            marker: this printed marker
         """
         return await self._run(
             "gimbal",
             pitch=pitch,
             yaw=yaw,
-            track=track,
             class_=class_,
             latitude=latitude,
             longitude=longitude,
             altitude=altitude,
+            track=track,
+            marker=marker,
         )
 
     async def select(

@@ -15,7 +15,7 @@ from companion.guidance.behaviours.follow_path import FollowPath
 from companion.guidance.behaviours.figure_eight import FigureEight
 from companion.guidance.behaviours.orbit import Orbit
 from companion.guidance.behaviours.seek import Seek
-from companion.guidance.behaviours.approach_with_retry import Approach
+from companion.guidance.behaviours.approach import Approach
 from companion.guidance.behaviours.follow import Follow
 from companion.guidance.behaviours.policy import Policy
 from companion.guidance.behaviours.patrol import Patrol

@@ -12,7 +12,7 @@ from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.in_view import ObjectsInView
 from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.objects.subject import NO_TRACKS, RecentTracks, Subject
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import Target
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
@@ -112,7 +112,6 @@ class BehaviourContext:
         ranging: which means of range estimation are available.
         max_acceleration_mps2: the envelope's limit.
         goal_ned_m: `Outcome.goal_ned_m` of the previous behaviour; None: it had none.
-        tracks: of the steering camera, those that have ended included.
         velocities: the newest message of each sender on the topic `velocity`, the first sender first.
         camera_fault: why nothing that the steering camera shows is used; empty: it is.
         parameters: of the autopilot.
@@ -139,7 +138,6 @@ class BehaviourContext:
     ranging: RangeMeans = ALL_MEANS
     max_acceleration_mps2: float = 3.0
     goal_ned_m: Vector3 | None = None
-    tracks: RecentTracks = NO_TRACKS
     steering_markers: MarkerSight = NO_MARKERS
     planned: PlannedPath | None = None
     avoiding: bool = False
@@ -147,16 +145,6 @@ class BehaviourContext:
     camera_fault: str = ""
     parameters: AutopilotParameters = NOTHING_READ
     objects: ObjectsInView = field(default_factory=ObjectsInView)
-
-    def targets_of(self, wanted: Subject) -> tuple[Target, ...]:
-        """The newest frame's targets among which those of a command are."""
-        if wanted.marker_id is None:
-            return self.targets
-        return tuple(marker.as_target() for marker in self.steering_markers.targets)
-
-    def fresh(self, wanted: Subject) -> bool:
-        """Whether that frame is not too old."""
-        return self.perception_fresh if wanted.marker_id is None else self.steering_markers.fresh
 
     def perception_fault(self, default: str) -> str:
         """Why targets cannot be used, in words; `default` where neither gimbal nor camera is the reason."""
@@ -229,13 +217,6 @@ class RoutedSetpoint:
 BehaviourOutput = Setpoint | RoutedSetpoint | ModeRequest | Outcome
 
 
-def needs_to_see(wanted: Subject) -> frozenset[Requirement]:
-    """The requirements of a behaviour that flies to an object."""
-    if wanted.marker_id is not None:
-        return frozenset({Requirement.STEERING_MARKER})
-    return frozenset({Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE})
-
-
 class Behaviour(ABC):
     """Base class of behaviours. `name` is its word in the command grammar.
 
@@ -253,10 +234,10 @@ class Behaviour(ABC):
 
     name: str
     requirements: frozenset[Requirement] = frozenset()
-    # Classes that the detector must know.
+    # The object that it flies to, if it is about one: that must be visible (`needs`), and a track be there.
+    subject: Subject | None = None
+    # Further classes that the detector must know.
     class_names: tuple[str, ...] = ()
-    # The track that must be there, if it is about exactly one.
-    track_id: int | None = None
     # Vehicles whose poses must be fresh, if it requires NEIGHBOURS.
     neighbour_names: tuple[str, ...] = ()
     # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.
@@ -265,6 +246,15 @@ class Behaviour(ABC):
     later: Sequence[Behaviour] = ()
     # Replaced, never extended: a subclass need not call an `__init__`.
     _new_notes: Sequence[str] = ()
+
+    @property
+    def needs(self) -> frozenset[Requirement]:
+        """`requirements`, and those of seeing the subject."""
+        if self.subject is None:
+            return self.requirements
+        if self.subject.marker_id is not None:
+            return self.requirements | {Requirement.STEERING_MARKER}
+        return self.requirements | {Requirement.PERCEPTION, Requirement.DEPTH_OR_SIZE}
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """Points it would fly to if it began now, local NED metres, as far as they are known.

@@ -200,7 +200,7 @@ class BehaviourRunner:
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
         self._setpoints.clear_path()
-        if Requirement.POSITION in behaviour.requirements and not self._position_known(context):
+        if Requirement.POSITION in behaviour.needs and not self._position_known(context):
             return
         if not self._activated:
             self._activated, self._stepped_ns = True, None
@@ -210,14 +210,14 @@ class BehaviourRunner:
                 self.goal_ned_m = None
         dt_s = 0.0 if self._stepped_ns is None else (context.now_ns - self._stepped_ns) / 1e9
         step: BehaviourOutput = behaviour.update(dt_s, context)
-        for note in behaviour.take_notes():
+        for note in (*behaviour.take_notes(), *context.objects.take_notes()):
             self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = context.now_ns
         if isinstance(step, RoutedSetpoint):
             offboard = self._modes.phase is Phase.OFFBOARD
             step = self._setpoints.steer(step, context, behaviour.name, offboard=offboard)
         self.active = active = behaviour.active
-        self._landing, self.approached, self.needs = active.landing, active.approached, active.requirements
+        self._landing, self.approached, self.needs = active.landing, active.approached, active.needs
         self.gimbal_user = active.name if active.gimbal_aim is not None else ""
         match step:
             case Outcome():

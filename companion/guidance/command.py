@@ -10,6 +10,9 @@ that the command becomes, and registers itself:
         def build(self, context: BuildContext) -> Behaviour:
             return CircleBehaviour(self.radius_m)
 
+A field `subject: Subject` gives the arguments `class`, `track` and `marker`, of which exactly one must be
+given (`Subject | None = None`: at most one).
+
 Grammar, help, documentation and JSON Schema are generated from the table. A file outside of this package is
 loaded only if the setting `plugins.modules` names it (`companion.plugins`).
 """
@@ -19,13 +22,13 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import MISSING, Field, dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from functools import cache
-from typing import Any, ClassVar, TypeVar, dataclass_transform, get_args, get_type_hints
+from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform, get_args, get_type_hints
 
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.objects.subject import GimbalGoal
+from companion.guidance.objects.subject import GimbalGoal, Subject
 from companion.guidance.search_pattern import Footprint
 from vision.class_names import class_named, near_names
 from vision.registry import RegistrationError
@@ -254,8 +257,7 @@ class Command(ABC):
         word: name in the grammar. help: one line.
         takes_attachment: further lines may be sent along.
         renamed: former key of an argument → its current key, for the error message.
-        either: keys of which exactly one must be given; the first may be written without its key.
-        stated: names of fields that were asked for: the text has them also where they equal their default.
+        stated: names of parts that were asked for: the text has them also where they equal their default.
 
     >>> from companion import Behaviour, BuildContext, Command
     >>> from companion.guidance.behaviours.hold import HoldBehaviour
@@ -270,22 +272,13 @@ class Command(ABC):
     help: ClassVar[str]
     takes_attachment: ClassVar[bool] = False
     renamed: ClassVar[Mapping[str, str]] = {}
-    either: ClassVar[tuple[str, ...]] = ()
     stated: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self) -> None:
-        given = []
-        for field, argument in arguments_of(type(self)):
-            value = getattr(self, field.name)
-            if value is not None or field.default is not None:
-                check(self.word, argument, value, default_of(field))
-            if argument.key in self.either and value != default_of(field):
-                given.append(argument.key)
-        if self.either and len(given) != 1:
-            wanted = " or ".join(self.either)
-            if given:
-                raise GrammarError(f"{self.word}: give either {wanted}, got {both_of(given)}")
-            raise GrammarError(f"{self.word}: {wanted} is missing")
+        for part, argument in arguments_of(type(self)):
+            value = value_of(self, part)
+            if value is not None or part.default is not None:
+                check(self.word, argument, value, default_of(part))
 
     @abstractmethod
     def build(self, context: BuildContext) -> Behaviour:
@@ -307,25 +300,41 @@ class Command(ABC):
 
     def __str__(self) -> str:
         words = [self.word]
-        for index, (field, argument) in enumerate(arguments_of(type(self))):
-            value = getattr(self, field.name)
-            if value in (None, "") or (value == default_of(field) and field.name not in self.stated):
+        for index, (part, argument) in enumerate(arguments_of(type(self))):
+            value = value_of(self, part)
+            if value in (None, "") or (value == default_of(part) and part.name not in self.stated):
                 continue
             written = _quoted(value) if isinstance(value, str) else _plain_number(value)
             # All words without a key may belong to the first argument.
-            bare = index == 0 and (field.default is MISSING or isinstance(argument, ClassName))
+            bare = index == 0 and (part.default is MISSING or isinstance(argument, ClassName))
             words.append(written if bare else f"{argument.key}={written}")
         return " ".join(words)
 
 
 def make_stated(kind: type[Command], values: Mapping[str, Any]) -> Command:
-    """A command of which these fields are stated. Raises GrammarError."""
-    return _stating(kind(**values), values)
+    """A command of which these parts are stated. Raises GrammarError."""
+    either = either_of(kind)
+    if either and all(values.get(name, "") == "" for name in _SUBJECT):
+        raise GrammarError(f"{kind.word}: {' or '.join(either)} is missing")
+    return _stating(kind(**_fields(kind, values)), values)
 
 
 def changed(command: Command, **changes: Any) -> Command:
-    """The command with other values, which are stated too. Raises GrammarError."""
-    return _stating(replace(command, **changes), {*command.stated, *changes})
+    """The command with other parts, which are stated too. Raises GrammarError."""
+    return _stating(replace(command, **_fields(type(command), changes)), {*command.stated, *changes})
+
+
+def _fields(kind: type[Command], values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values by field: the parts of a subject are one."""
+    parts = [part for part, _ in arguments_of(kind) if part.of_subject]
+    given = [part for part in parts if values.get(part.name, "") != ""]
+    if len(given) > 1:
+        got = both_of([_SUBJECT[part.name].key for part in given])
+        raise GrammarError(f"{kind.word}: give either {SUBJECT_KEYS}, got {got}")
+    found = {name: value for name, value in values.items() if name not in _SUBJECT or not parts}
+    if given:
+        found[given[0].of_subject] = Subject(**{given[0].name: values[given[0].name]})
+    return found
 
 
 def _stating(command: Command, names: Iterable[str]) -> Command:
@@ -339,16 +348,65 @@ def both_of(keys: Sequence[str]) -> str:
     return f"{'both ' if len(keys) == 2 else ''}{' and '.join(keys)}"
 
 
+class Part(NamedTuple):
+    """What an argument sets: a field of the command, or a part of its subject.
+
+    Attributes:
+        name: of the field, here or in `Subject`. default: MISSING where it is required.
+        of_subject: the field that holds the subject; empty: it is a field itself.
+    """
+
+    name: str
+    default: Any
+    of_subject: str = ""
+
+
+_SUBJECT: dict[str, Argument] = {
+    "class_name": ClassName("class", "an object of this class"),
+    "track_id": TrackId("track", "the object of this track"),
+    "marker_id": MarkerId("marker", "this printed marker"),
+}
+SUBJECT_KEYS = " or ".join(argument.key for argument in _SUBJECT.values())
+
+
 @cache  # evaluates annotations: half a millisecond
-def arguments_of(kind: type[Command]) -> tuple[tuple[Field[Any], Argument], ...]:
-    """The fields of a command with their argument types, in order."""
+def arguments_of(kind: type[Command]) -> tuple[tuple[Part, Argument], ...]:
+    """The parts of a command with their argument types, in order: a subject's track and marker at the end."""
     hints = get_type_hints(kind, include_extras=True)
-    return tuple((field, get_args(hints[field.name])[1]) for field in fields(kind))
+    found: list[tuple[Part, Argument]] = []
+    last: list[tuple[Part, Argument]] = []
+    for each in fields(kind):
+        if _is_subject(hints[each.name]):
+            named, *last = [(Part(name, None, each.name), argument) for name, argument in _SUBJECT.items()]
+            found.append(named)
+        else:
+            found.append((Part(each.name, each.default), get_args(hints[each.name])[1]))
+    return (*found, *last)
 
 
-def default_of(field: Field[Any]) -> Any:
-    """The default of a field; None where the argument is required."""
-    return None if field.default is MISSING else field.default
+def either_of(kind: type[Command]) -> tuple[str, ...]:
+    """Keys of which exactly one must be given; the first may be written without its key."""
+    hints = get_type_hints(kind, include_extras=True)
+    needed = any(hints[each.name] is Subject and each.default is MISSING for each in fields(kind))
+    return tuple(argument.key for argument in _SUBJECT.values()) if needed else ()
+
+
+def value_of(command: Command, part: Part) -> Any:
+    """The value of a part; None: not given."""
+    if not part.of_subject:
+        return getattr(command, part.name)
+    subject = getattr(command, part.of_subject)
+    value = None if subject is None else getattr(subject, part.name)
+    return None if value == "" else value
+
+
+def default_of(part: Part) -> Any:
+    """The default of a part; None where the argument is required."""
+    return None if part.default is MISSING else part.default
+
+
+def _is_subject(hint: Any) -> bool:
+    return hint is Subject or hint == Subject | None
 
 
 def _quoted(text: str) -> str:
@@ -380,7 +438,7 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
 
     Raises:
         RegistrationError: the word has other characters, or is already registered, or a field's type is not
-            annotated with an argument (`Annotated[float, Number(...)]`).
+            annotated with an argument (`Annotated[float, Number(...)]`), and is no Subject.
 
     >>> from typing import Annotated
     >>> from companion import Behaviour, BuildContext, Command, Number, behaviour
@@ -408,9 +466,10 @@ def behaviour(word: str, help_text: str) -> Callable[[type[_Kind]], type[_Kind]]
         made = dataclass(frozen=True)(kind)
         hints = get_type_hints(made, include_extras=True)
         for field in fields(made):
-            if not any(isinstance(part, Argument) for part in get_args(hints[field.name])[1:2]):
+            hint = hints[field.name]
+            if not _is_subject(hint) and not any(isinstance(a, Argument) for a in get_args(hint)[1:2]):
                 raise RegistrationError(
-                    f"{name}.{field.name}: expected Annotated[type, argument], got {field.type}"
+                    f"{name}.{field.name}: expected Annotated[type, argument] or Subject, got {field.type}"
                 )
         made.word, made.help = word, help_text
         COMMANDS[word] = made

@@ -127,9 +127,9 @@ def _awaited(command: CommandInput, context: BehaviourContext) -> str:
     state = context.state
     if ends_flight(behaviour) and (not state.heartbeat_ns or state.not_flown in NOT_KNOWN_YET):
         return _AUTOPILOT
-    needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.requirements)
+    needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.needs)
     for later in () if behaviour is None else behaviour.later:
-        needed |= later.requirements
+        needed |= later.needs
     if Requirement.GIMBAL in needed and not is_known(context.state.gimbal, context.now_ns):
         return _GIMBAL
     if Requirement.HOME in needed and context.state.home_fault() is not None:

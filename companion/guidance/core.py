@@ -34,7 +34,7 @@ from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.guidance.mode_control import ModeControl, Phase
 from companion.guidance.objects.closing_check import ClosingCheck
 from companion.guidance.objects.in_view import Choice, ObjectsInView
-from companion.guidance.objects.subject import RecentTracks, Subject
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
@@ -84,7 +84,6 @@ class Guidance:
         self._out = OutputCollector()
         self._setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
         self._modes = ModeControl(self._setpoints, self._out)
-        self._tracks = RecentTracks(max_age_s=options.track_max_age_s)
         self._objects: tuple[TrackedObject, ...] = ()
         self._marker_objects: tuple[TrackedObject, ...] = ()
         self._choices: dict[Subject, Choice] = {}
@@ -255,7 +254,6 @@ class Guidance:
         """The computer or the process stood still: whatever was commanded before ends, also what waits."""
         self._queue.supersede(f"an event ({standstill.why})", self._out)
         self._runner.end_after_standstill(standstill.why)
-        self._tracks = RecentTracks(max_age_s=self._options.track_max_age_s)
         self._objects = self._marker_objects = ()
         if standstill.long or standstill.suspended:
             self._standstill = standstill
@@ -289,7 +287,6 @@ class Guidance:
             age_s is not None and age_s <= self.options.perception_max_age_s and not gimbal.direction_fault
         )
         targets = inputs.targets if fresh else ()
-        self._tracks = self._tracks.updated(targets)
         context = BehaviourContext(
             now_ns,
             inputs.state,
@@ -305,7 +302,6 @@ class Guidance:
             goal_ned_m=self._runner.goal_ned_m,
             gimbal=gimbal,
             ranging=inputs.ranging,
-            tracks=self._tracks,
             steering_markers=inputs.steering_markers,
             planned=inputs.planned,
             avoiding=self.options.avoid,
@@ -319,8 +315,18 @@ class Guidance:
             self._objects = inputs.objects
         if context.steering_markers.fresh:
             self._marker_objects = inputs.marker_objects
-        yaw_rad = 0.0 if context.state.yaw_rad is None else context.state.yaw_rad
-        in_view = ObjectsInView(self._objects, self._marker_objects, now_ns, yaw_rad, self._choices)
+        fault = context.perception_fault("no detections received")
+        in_view = ObjectsInView(
+            self._objects,
+            self._marker_objects,
+            now_ns,
+            0.0 if context.state.yaw_rad is None else context.state.yaw_rad,
+            context.state.position_ned_m,
+            "" if context.perception_fresh else fault,
+            "" if context.steering_markers.fresh else fault,
+            self._options.track_max_age_s,
+            self._choices,
+        )
         return replace(context, objects=in_view)
 
     def _without_wrong_cameras(self, context: BehaviourContext) -> BehaviourContext:

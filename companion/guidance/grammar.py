@@ -37,6 +37,7 @@ from companion.guidance.command import (
     Word,
     arguments_of,
     default_of,
+    either_of,
     known_class,
     make_stated,
     names_in,
@@ -72,19 +73,20 @@ def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
     for field, argument in arguments_of(kind):
         if field.default is MISSING and field.name not in values:
             raise GrammarError(f"{word}: {argument.key} is missing ({argument.meaning}): {usage(kind)}")
-    if kind.either and not any(f.name in values for f, a in arguments_of(kind) if a.key in kind.either):
-        raise GrammarError(f"{word}: {' or '.join(kind.either)} is missing: {usage(kind)}")
+    either = either_of(kind)
+    if either and not any(part.name in values for part, a in arguments_of(kind) if a.key in either):
+        raise GrammarError(f"{word}: {' or '.join(either)} is missing: {usage(kind)}")
     return make_stated(kind, values)
 
 
 def usage(kind: type[Command]) -> str:
     """One line: the syntax of a command with its defaults."""
-    words = [kind.word]
+    words, either = [kind.word], either_of(kind)
     for field, argument in arguments_of(kind):
         default = default_of(field)
-        if argument.key in kind.either:
-            if argument.key == kind.either[0]:
-                others = [f"{key}=…" for key in kind.either[1:]]
+        if argument.key in either:
+            if argument.key == either[0]:
+                others = [f"{key}=…" for key in either[1:]]
                 words.append("|".join([argument.key.upper(), *others]))
         elif field.default is MISSING:
             words.append(argument.key.upper())
@@ -136,8 +138,8 @@ def markdown() -> str:
             default = default_of(field)
             if field.default is MISSING:
                 shown = "required"
-            elif argument.key in kind.either:
-                shown = f"{' or '.join(kind.either)} required"
+            elif argument.key in either_of(kind):
+                shown = f"{' or '.join(either_of(kind))} required"
             elif default in (None, ""):
                 shown = "–"
             else:
@@ -180,8 +182,8 @@ def json_schema(class_names: Sequence[str] | None = None) -> dict[str, Any]:
             "required": [a.key for field, a in arguments_of(kind) if field.default is MISSING],
             "additionalProperties": False,
         }
-        if kind.either:
-            commands[kind.word]["oneOf"] = [{"required": [key]} for key in kind.either]
+        if either := either_of(kind):
+            commands[kind.word]["oneOf"] = [{"required": [key]} for key in either]
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", "$defs": commands}
 
 

@@ -46,13 +46,13 @@ def check_requirements(
     if (why := context.state.not_flown) is not None:
         return why
     rules = (class_names, battery, obstacles)
-    if missing := _missing(behaviour, behaviour.requirements, context, *rules):
+    if missing := _missing(behaviour, behaviour.needs, context, *rules):
         return f"{behaviour.name} needs {' and '.join(missing)}"
     for later in behaviour.later:
-        if missing := _missing(later, later.requirements - OF_THE_MOMENT, context, *rules):
+        if missing := _missing(later, later.needs - OF_THE_MOMENT, context, *rules):
             return f"{behaviour.name}: {later.name} needs {' and '.join(missing)}"
-    if behaviour.track_id is not None:
-        why = context.tracks.missing(behaviour.track_id, context.now_ns)
+    if behaviour.subject is not None and behaviour.subject.track_id is not None:
+        why = context.objects.missing(behaviour.subject)
         return None if why is None else f"{behaviour.name}: {why}"
     return None
 
@@ -105,7 +105,8 @@ def _missing(
     if (depth := obstacles.missing(behaviour, context)) is not None:
         missing.append(depth)
     if class_names is not None:
-        unknown = [name for name in behaviour.class_names if name not in class_names]
+        known = () if behaviour.subject is None else behaviour.subject.class_names
+        unknown = [name for name in (*behaviour.class_names, *known) if name not in class_names]
         if unknown:
             missing.append(f"a detector that knows {', '.join(unknown)}")
     return missing
@@ -113,8 +114,10 @@ def _missing(
 
 def _class_names(behaviour: Behaviour, context: BehaviourContext) -> tuple[str, ...]:
     """The classes that it flies to, its track's included."""
-    track = None if behaviour.track_id is None else context.tracks.newest(behaviour.track_id)
-    return behaviour.class_names if track is None else (*behaviour.class_names, track.class_name)
+    subject = behaviour.subject
+    if subject is None or subject.track_id is None:
+        return (*behaviour.class_names, *(() if subject is None else subject.class_names))
+    return tuple({each.class_name for each in context.objects.objects if subject.means(each)})
 
 
 def _where(context: BehaviourContext) -> str:

@@ -6,10 +6,9 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from dataclasses import fields as fields_of
 from typing import Any
 
-from companion.guidance.command import COMMANDS, Command, changed, make_stated
+from companion.guidance.command import COMMANDS, Command, arguments_of, changed, make_stated, value_of
 from companion.language.nouns import COLOUR_WORDS, classes_of, noun_pattern
 from companion.language.scene import Scene, SceneObject
 
@@ -231,9 +230,11 @@ class Clause:
     def _same_object(self) -> dict[str, Any]:
         if self.focus:
             return self.focus
-        for key in ("track_id", "marker_id", "class_name"):
-            if value := getattr(self._scene.last, key, None):
-                return {key: value}
+        last = self._scene.last
+        for part, _ in () if last is None else arguments_of(type(last)):
+            named = part.name in ("track_id", "marker_id", "class_name")
+            if last is not None and named and (value := value_of(last, part)) is not None:
+                return {part.name: value}
         seen = [each for each in self._scene.objects if each.track_id is not None]
         if len(seen) == 1:
             return {"track_id": seen[0].track_id}
@@ -450,11 +451,9 @@ class Clause:
         last, target = self._scene.last, self.target()
         if last is None or not target:
             raise self._not_understood()
-        keys = ("class_name", "track_id", "marker_id")
-        named = {each.name: each.default for each in fields_of(last) if each.name in keys}
-        if not target.keys() <= named.keys():
+        if not target.keys() <= {part.name for part, _ in arguments_of(type(last))}:
             raise self._not_understood()
-        return changed(last, **(named | target))
+        return changed(last, **target)
 
     def shifted(self, found: re.Match[str]) -> Command:
         """ "five metres closer"."""

@@ -1,8 +1,13 @@
-"""Approach: fly to an object and stop before it, servoing on its filtered position."""
+"""Approach: fly to an object and stop before it, servoing on its filtered position.
+
+A lost object of a class is searched where it was last seen, then by a full turn.
+"""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Annotated
 
 from companion.guidance.behaviour import (
     Behaviour,
@@ -11,9 +16,22 @@ from companion.guidance.behaviour import (
     Outcome,
     Requirement,
     RoutedSetpoint,
-    needs_to_see,
 )
-from companion.guidance.gimbal.pitch import GimbalTracking
+from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.command import (
+    BuildContext,
+    Command,
+    GrammarError,
+    Number,
+    behaviour,
+)
+from companion.guidance.gimbal.pitch import (
+    LEAST_SWEEP_DEG,
+    USUAL_RATE_DPS,
+    GimbalSweep,
+    GimbalTracking,
+    GimbalUse,
+)
 from companion.guidance.motion import (
     ARRIVED_M,
     STOPPING_MPS2,
@@ -24,6 +42,7 @@ from companion.guidance.motion import (
     ground_speed,
     position_and_yaw,
     speed_of,
+    stay_at,
     stopping_point,
     stopping_speed,
 )
@@ -31,6 +50,7 @@ from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import RangeSource
 from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.search_pattern import NARROW_FIELD_RAD, field_of_view_rad
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -51,20 +71,84 @@ LOST_AFTER_S = 1.0
 # Nearer than this the bearing to the object's nearest point is too noisy to follow.
 MIN_YAW_RANGE_M = 1.0
 BASE_TIMEOUT_S = 45.0
+# How long to look at the last known position, once the nose points there.
+LOOK_BACK_S = 3.0
+# Time for half a turn at the slowest useful yaw rate.
+LOOK_BACK_LIMIT_S = 12.0
+POINTED_RAD = math.radians(6.0)
+
+
+@dataclass(slots=True)
+class _Search:
+    """The search for a lost object: first where it was, then by a full turn.
+
+    Attributes:
+        why: how it was lost. pointed_ns: since when the nose points to `lost_at`; None: not yet.
+        seek: the turn; None: not begun.
+    """
+
+    why: str
+    lost_at: Vector3
+    hold_point: Vector3
+    begun_ns: int
+    pointed_ns: int | None = None
+    seek: SeekBehaviour | None = None
+
+
+@behaviour(
+    "approach", "fly to an object of the class, a track or a marker, keeping the height, and stop before it"
+)
+class Approach(Command):
+    subject: Subject
+    distance_m: Annotated[
+        float, Number("distance", "m", 1.0, 100.0, "where to stop, over ground to its nearest surface")
+    ] = 5.0
+    speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 10.0, "maximum speed")] = 2.0
+    confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.3
+    lost_timeout_s: Annotated[
+        float, Number("lost_timeout", "s", 0.5, 60.0, "wait for a lost object this long")
+    ] = 5.0
+    retries: Annotated[
+        float,
+        Number(
+            "retries",
+            "",
+            0.0,
+            20.0,
+            "how often to search for a lost object, unless it is a track or a marker",
+        ),
+    ] = 2.0
+    gimbal: GimbalUse = "leave"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.retries != int(self.retries):
+            raise GrammarError(f"approach: retries must be a whole number, got {self.retries:g}")
+
+    def build(self, context: BuildContext) -> Behaviour:
+        return ApproachBehaviour(
+            self.subject,
+            distance_m=self.distance_m,
+            speed_mps=self.speed_mps,
+            confidence=self.confidence,
+            lost_timeout_s=self.lost_timeout_s,
+            retries=int(self.retries) if self.subject.class_name else 0,  # a search would find another track
+            tracking=GimbalTracking() if self.gimbal == "track" else None,
+            field_rad=field_of_view_rad(context.footprint),
+        )
 
 
 class ApproachBehaviour(Behaviour):
     """Keeps the height, yaws to the object and stops `distance_m` over ground before its surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
-    stays with it. After losing it, it brakes and waits for `lost_timeout_s` before it fails.
+    It chooses the confirmed object of the class ahead, or the track or marker, and stays with it. After
+    losing it, it brakes and waits for `lost_timeout_s`. Then it looks at the last known position and turns
+    once, up to `retries` times, and approaches what it finds.
 
     Args:
-        class_name, track_id, marker_id: exactly one of them.
+        retries: how often to search for a lost object of the class.
         tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
-
-    Attributes:
-        lost_at: last known position of the object, if losing it ended the approach.
+        field_rad: the camera's horizontal field of view.
     """
 
     name = "approach"
@@ -72,30 +156,27 @@ class ApproachBehaviour(Behaviour):
 
     def __init__(
         self,
-        class_name: str = "",
+        subject: Subject,
         *,
-        track_id: int | None = None,
-        marker_id: int | None = None,
         distance_m: float = 5.0,
         speed_mps: float = 2.0,
         confidence: float = 0.3,
         lost_timeout_s: float = 5.0,
+        retries: int = 0,
         tracking: GimbalTracking | None = None,
+        field_rad: float = NARROW_FIELD_RAD,
     ) -> None:
-        self._tracking = tracking
-        self._subject = Subject(class_name, track_id, marker_id)
-        self.requirements = ApproachBehaviour.requirements | needs_to_see(self._subject)
+        self._tracking, self._field_rad = tracking, field_rad
+        self.subject: Subject = subject
         if tracking is not None:
-            self.requirements |= {Requirement.GIMBAL}
-        self.class_names, self.track_id = self._subject.class_names, track_id
-        self.lost_at: Vector3 | None = None
+            self.requirements = ApproachBehaviour.requirements | {Requirement.GIMBAL}
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._confidence = confidence
-        self._lost_timeout_s = lost_timeout_s
+        self._lost_timeout_s, self._retries = lost_timeout_s, retries
+        self._tried = 0
+        self._search: _Search | None = None
         self._object: TrackedObject | None = None
-        self._doubted = False
         self._down_m = 0.0
-        self._seen_ns = 0
         self._until_ns: float = math.inf
         self._started_ns = 0
         self._bearing_rad: float | None = None
@@ -105,25 +186,29 @@ class ApproachBehaviour(Behaviour):
         self._range_m = math.nan
 
     def on_activate(self, context: BehaviourContext) -> None:
+        self._tried = 0
+        self._begin(context)
+
+    def _begin(self, context: BehaviourContext) -> None:
+        self._search = None
         position, _ = position_and_yaw(context.state)
         self._down_m = position[2]
-        self._started_ns = self._seen_ns = context.now_ns
+        self._started_ns = context.now_ns
         self._until_ns = context.now_ns + BASE_TIMEOUT_S * 1e9
         self._object = self._bearing_rad = self._wait_point = self._anchor_rad = None
-        context.objects.forget(self._subject)
-        self._doubted = False
-        self.lost_at = None
+        context.objects.forget(self.subject)
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
         if self._tracking is not None:
             self._tracking.begin(context)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if self._search is not None:
+            return self._look_for_it(self._search, dt_s, context)
         now_ns, state = context.now_ns, context.state
         position, yaw_rad = position_and_yaw(state)
         self._observe(context)
         track = self._object
-        unseen_s = (now_ns - self._seen_ns) / 1e9
         if track is not None:
             point = track.position_at(now_ns)
             north, east, _ = point
@@ -136,11 +221,12 @@ class ApproachBehaviour(Behaviour):
         if now_ns > self._until_ns:
             away = f"still {self._range_m:.1f} m away" if track else "range never known"
             took_s = (now_ns - self._started_ns) / 1e9
-            return Outcome(False, f"did not reach {self._subject.phrase} in {took_s:.0f} s: {away}")
+            return Outcome(False, f"did not reach {self.subject.phrase} in {took_s:.0f} s: {away}")
         # On a way around obstacles they hide the object: it is flown on to where it was last seen.
         lost_s = self._lost_timeout_s if context.avoiding else LOST_AFTER_S
-        if track is None or unseen_s > lost_s or not context.fresh(self._subject):
-            return self._wait(dt_s, context, position, unseen_s)
+        blind = context.objects.fault_of(self.subject)
+        if track is None or track.unseen_s(now_ns) > lost_s or blind:
+            return self._wait(dt_s, context, position)
         if self._wait_point is not None:
             self._wait_point, self._controller = None, PositionController()
 
@@ -154,7 +240,7 @@ class ApproachBehaviour(Behaviour):
             off_m = math.inf if track.moving else math.dist(goal, position)
             near_m = REACHED_M if self._by_depth else ARRIVED_M
             if self._arrival.update(off_m, speed_of(state), now_ns, near_m):
-                return Outcome(True, f"reached {self._subject.name} at {self._range_m:.1f} m", goal)
+                return Outcome(True, f"reached {self.subject.name} at {self._range_m:.1f} m", goal)
             velocity = self._controller.velocity(goal, state, dt_s, top)
             return Setpoint.velocity(velocity, now_ns, yaw_rad=self._bearing_rad)
         speed = stopping_speed(error_m, top, STOPPING_MPS2)
@@ -171,39 +257,41 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def approached(self) -> Approached | None:
-        return None if self._object is None else Approached(self._object.detection)
+        if self._object is None or self._search is not None:
+            return None
+        return Approached(self._object.detection)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
-        return None if self._tracking is None else self._tracking.aim
+        if self._tracking is None:
+            return None
+        seek = None if self._search is None else self._search.seek
+        return (None if seek is None else seek.gimbal_aim) or self._tracking.aim
 
     @property
     def status(self) -> str:
+        if self._search is not None:
+            doing = "where it was" if self._search.seek is None else "all around"
+            return f"lost {self.subject.phrase}, searching {doing} ({self._tried} of {self._retries})"
         if self._object is None:
-            return f"looking for {self._subject.phrase}"
+            return f"looking for {self.subject.phrase}"
         if self._wait_point is not None:
-            return f"lost {self._subject.phrase_now(self._object.track_id)}, waiting"
-        return f"{self._subject.phrase_now(self._object.track_id)} {self._range_m:.1f} m away"
+            return f"lost {self.subject.phrase_now(self._object.track_id)}, waiting"
+        return f"{self.subject.phrase_now(self._object.track_id)} {self._range_m:.1f} m away"
 
     def _observe(self, context: BehaviourContext) -> None:
-        seen = context.objects.of(self._subject, self._confidence)
+        seen = context.objects.of(self.subject, self._confidence)
         if seen is None:
-            fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
-            if fitting:
-                self._doubted = not any(target.trusted for target in fitting)
+            if (target := context.objects.in_sight(self.subject)) is not None:
+                # Fully inside the image it may get a range.
+                self._bearing_rad = target.bearing_rad
+                if self._tracking is not None:
+                    self._tracking.turn_to(target, context)
             return
-        if seen.position_ned_m is None:
-            # Fully inside the image it may get a range.
-            self._bearing_rad = seen.detection.bearing_rad
-            if self._tracking is not None:
-                self._tracking.turn_to(seen.detection, context)
-            return
-        before, self._object, self._seen_ns = self._object, seen, seen.last_ns
-        if before is None:
+        if self._object is None:
             path_m = abs(seen.detection.ground_range_m - self._distance_m)
             self._until_ns = context.now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9
-        else:
-            self.add_notes(*self._subject.new_id(before.track_id, seen.track_id))
+        self._object = seen
 
     def _goal(self, point: Vector3, position: Vector3, bearing: float) -> Vector3 | None:
         """The point to stop at, once it is near: on the vehicle's side of the object."""
@@ -229,24 +317,14 @@ class ApproachBehaviour(Behaviour):
         self._anchor_rad = None
         self._arrival, self._controller = Arrival(), PositionController()
 
-    def _wait(
-        self, dt_s: float, context: BehaviourContext, position: Vector3, unseen_s: float
-    ) -> BehaviourOutput:
+    def _wait(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         """Object not seen: brake, hold where the vehicle comes to rest, and keep the heading."""
         if self._wait_point is None:
             self._leave_goal()
-        if unseen_s > self._lost_timeout_s:
-            if not context.fresh(self._subject):
-                why = context.perception_fault("no detections received")
-            elif self._doubted:
-                why = self._subject.doubted
-            elif self._object is None:
-                why = "never seen with a known range"
-            else:
-                why = f"last seen {self._range_m:.1f} m away"
-                self.lost_at = self._object.position_at(context.now_ns)
-                why += context.tracks.replacement(self._object.detection, context.now_ns)
-            return Outcome(False, f"lost {self._subject.phrase} for {unseen_s:.1f} s: {why}")
+        if (why := context.objects.lost(self.subject, self._lost_timeout_s)) is not None:
+            if self._object is None or context.objects.fault_of(self.subject):
+                return Outcome(False, why)
+            return self._look_again(why, self._object.position_at(context.now_ns), context)
         if self._wait_point is None and ground_speed(context.state) < STANDING_MPS:
             north, east, _ = stopping_point(context.state)
             self._wait_point = (north, east, self._down_m)
@@ -257,3 +335,59 @@ class ApproachBehaviour(Behaviour):
         if self._bearing_rad is None:
             return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
         return Setpoint.velocity(velocity, context.now_ns, yaw_rad=self._bearing_rad)
+
+    def _look_again(self, why: str, lost_at: Vector3, context: BehaviourContext) -> BehaviourOutput:
+        """Start another search where the object was; the outcome if the retries are used up."""
+        if self._tried >= self._retries:
+            times = "once" if self._tried == 1 else f"{self._tried} times"
+            return Outcome(False, why + (f"; searched again {times}" if self._tried else ""))
+        self._tried += 1
+        self.add_notes(f"approach: {why}; searching, {self._tried} of {self._retries}")
+        here, _ = position_and_yaw(context.state)
+        context.objects.forget(self.subject)
+        self._search = search = _Search(why, lost_at, here, context.now_ns)
+        return self._look_back(search, context)
+
+    def _look_for_it(self, search: _Search, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if self._tracking is not None and (why := self._tracking.control_fault(context)) is not None:
+            return Outcome(False, f"approach lost the gimbal: {why}")
+        if search.seek is None:
+            return self._look_back(search, context)
+        step = search.seek.update(dt_s, context)
+        if not isinstance(step, Outcome):
+            return step
+        if step.success:
+            return self._go_there(context, step.reason)
+        if not context.perception_fresh:
+            return Outcome(False, f"{search.why}; {step.reason}")
+        return self._look_again(search.why, search.lost_at, context)
+
+    def _look_back(self, search: _Search, context: BehaviourContext) -> BehaviourOutput:
+        """Hold with the nose towards the last known position; then turn."""
+        now_ns = context.now_ns
+        position, yaw_rad = position_and_yaw(context.state)
+        if context.objects.of(self.subject, self._confidence) is not None:
+            return self._go_there(context, f"found {self.subject.phrase} where it was")
+        bearing_rad = math.atan2(search.lost_at[1] - position[1], search.lost_at[0] - position[0])
+        if search.pointed_ns is None and abs(wrap_angle(bearing_rad - yaw_rad)) < POINTED_RAD:
+            search.pointed_ns = now_ns
+        looked_ns = 0 if search.pointed_ns is None else now_ns - search.pointed_ns
+        if looked_ns > LOOK_BACK_S * 1e9 or now_ns - search.begun_ns > LOOK_BACK_LIMIT_S * 1e9:
+            search.seek = SeekBehaviour(
+                self.subject.class_name, laps=1.0, confidence=self._confidence, sweep=self._sweep()
+            )
+            search.seek.on_activate(context)
+            return search.seek.update(0.0, context)
+        return Setpoint.velocity(stay_at(search.hold_point, position), now_ns, yaw_rad=bearing_rad)
+
+    def _sweep(self) -> GimbalSweep | None:
+        """A sweep between the pitch at which the object was lost and level."""
+        aim = None if self._tracking is None else self._tracking.aim
+        if aim is None or abs(math.degrees(aim.pitch_rad)) < LEAST_SWEEP_DEG:
+            return None
+        return GimbalSweep(aim.pitch_rad, math.radians(USUAL_RATE_DPS), self._field_rad)
+
+    def _go_there(self, context: BehaviourContext, note: str) -> BehaviourOutput:
+        self.add_notes(f"approach: {note}")
+        self._begin(context)
+        return self.update(0.0, context)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from companion.guidance.behaviour import (
     Behaviour,
@@ -11,20 +11,16 @@ from companion.guidance.behaviour import (
     BehaviourOutput,
     Outcome,
     Requirement,
-    needs_to_see,
 )
 from companion.guidance.command import (
     BuildContext,
-    ClassName,
     Command,
     EnumArgument,
-    MarkerId,
     Number,
-    TrackId,
     behaviour,
 )
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
-from companion.guidance.motion import add_velocity_error, correction, in_degrees, position_and_yaw
+from companion.guidance.motion import add_velocity_error, correction, position_and_yaw
 from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.gimbal import GimbalAim
@@ -50,8 +46,7 @@ UNSEEN_S = 0.6
 
 @behaviour("follow", "keep a distance and a bearing to a moving object of the class, a track or a marker")
 class Follow(Command):
-    either: ClassVar[tuple[str, ...]] = ("class", "track", "marker")
-    class_name: Annotated[str, ClassName("class", "what to follow")] = ""
+    subject: Subject
     distance_m: Annotated[
         float, Number("distance", "m", 1.5, 100.0, "to keep, over ground to its nearest surface")
     ] = 8.0
@@ -82,8 +77,6 @@ class Follow(Command):
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
     gimbal: GimbalUse = "leave"
-    track_id: Annotated[int | None, TrackId("track", "follow this track, instead of a class")] = None
-    marker_id: Annotated[int | None, MarkerId("marker", "follow this marker, instead of a class")] = None
 
     @property
     def endless(self) -> bool:
@@ -91,9 +84,7 @@ class Follow(Command):
 
     def build(self, context: BuildContext) -> Behaviour:
         return FollowBehaviour(
-            self.class_name,
-            track_id=self.track_id,
-            marker_id=self.marker_id,
+            self.subject,
             distance_m=self.distance_m,
             bearing=self.bearing,
             angle_rad=math.radians(self.angle_deg),
@@ -108,11 +99,10 @@ class Follow(Command):
 class FollowBehaviour(Behaviour):
     """Keeps the height, yaws to the object and keeps `distance_m` over ground from its surface.
 
-    It selects the confirmed object of the class ahead (see `TargetSelector`), or the track or marker, and
+    It selects the confirmed object of the class ahead, or the track or marker, and
     stays with it. Unseen, it follows the prediction for `occlusion_s`; then it fails.
 
     Args:
-        class_name, track_id, marker_id: exactly one of them.
         bearing: where the vehicle stays, seen from the object: "here", its current direction; "compass",
             `angle_rad` clockwise from north; "course", that far clockwise from the object's direction of
             motion (π is behind it).
@@ -132,10 +122,8 @@ class FollowBehaviour(Behaviour):
 
     def __init__(
         self,
-        class_name: str = "",
+        subject: Subject,
         *,
-        track_id: int | None = None,
-        marker_id: int | None = None,
         distance_m: float = 8.0,
         bearing: str = "here",
         angle_rad: float = math.pi,
@@ -146,11 +134,9 @@ class FollowBehaviour(Behaviour):
         tracking: GimbalTracking | None = None,
     ) -> None:
         self._tracking = tracking
-        self._subject = Subject(class_name, track_id, marker_id)
-        self.requirements = FollowBehaviour.requirements | needs_to_see(self._subject)
+        self.subject: Subject = subject
         if tracking is not None:
-            self.requirements |= {Requirement.GIMBAL}
-        self.class_names, self.track_id = self._subject.class_names, track_id
+            self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
         self._distance_m, self._speed_mps = distance_m, speed_mps
         self._bearing, self._angle_rad = bearing, angle_rad
         self._confidence, self._occlusion_s = confidence, occlusion_s
@@ -159,9 +145,8 @@ class FollowBehaviour(Behaviour):
 
     def _forget(self, now_ns: int, down_m: float) -> None:
         self._object: TrackedObject | None = None
-        self._started_ns = self._seen_ns = now_ns
+        self._started_ns = now_ns
         self._down_m = down_m
-        self._doubted = False
         self._yaw_rad: float | None = None
         self._course_rad: float | None = None
         self._range_m = math.nan
@@ -170,7 +155,7 @@ class FollowBehaviour(Behaviour):
     def on_activate(self, context: BehaviourContext) -> None:
         position, _ = position_and_yaw(context.state)
         self._forget(context.now_ns, position[2])
-        context.objects.forget(self._subject)
+        context.objects.forget(self.subject)
         if self._tracking is not None:
             self._tracking.begin(context)
 
@@ -179,15 +164,15 @@ class FollowBehaviour(Behaviour):
         position, _ = position_and_yaw(state)
         self._observe(context)
         track = self._object
-        self._unseen_s = (now_ns - self._seen_ns) / 1e9
+        self._unseen_s = 0.0 if track is None else track.unseen_s(now_ns)
         if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
             if track is None:
                 return Outcome(
-                    False, f"no localized {self._subject.name!r} to follow in {self._duration_s:g} s"
+                    False, f"no localized {self.subject.name!r} to follow in {self._duration_s:g} s"
                 )
-            return Outcome(True, f"followed {self._subject.phrase} for {self._duration_s:g} s")
-        if self._unseen_s > self._occlusion_s:
-            return Outcome(False, self._lost(context))
+            return Outcome(True, f"followed {self.subject.phrase} for {self._duration_s:g} s")
+        if (why := context.objects.lost(self.subject, self._occlusion_s)) is not None:
+            return Outcome(False, why)
         if track is not None:
             point = track.position_at(now_ns)
             north, east = point[0] - position[0], point[1] - position[1]
@@ -247,38 +232,14 @@ class FollowBehaviour(Behaviour):
         return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
 
     def _observe(self, context: BehaviourContext) -> None:
-        seen = context.objects.of(self._subject, self._confidence)
-        if seen is None:
-            fitting = self._subject.of(context.targets_of(self._subject), self._confidence)
-            if fitting:
-                self._doubted = not any(target.trusted for target in fitting)
-            return
-        if seen.position_ned_m is None:
+        seen = context.objects.of(self.subject, self._confidence)
+        if seen is not None:
+            self._object = seen
+        elif (target := context.objects.in_sight(self.subject)) is not None:
             # Fully inside the image it may get a range.
-            self._yaw_rad = seen.detection.bearing_rad
+            self._yaw_rad = target.bearing_rad
             if self._tracking is not None:
-                self._tracking.turn_to(seen.detection, context)
-            return
-        before, self._object, self._seen_ns = self._object, seen, seen.last_ns
-        if before is not None:
-            self.add_notes(*self._subject.new_id(before.track_id, seen.track_id))
-
-    def _lost(self, context: BehaviourContext) -> str:
-        if not context.fresh(self._subject):
-            why = context.perception_fault("no detections received")
-        elif self._object is not None:
-            north, east = self._object.velocity_ned_mps
-            moving = (
-                f", moving at {math.hypot(north, east):.1f} m/s to {in_degrees(math.atan2(east, north))}°"
-            )
-            why = f"last expected {self._range_m:.1f} m away{moving}"
-            expected = self._object.position_at(context.now_ns)[:2]
-            why += context.tracks.replacement(self._object.detection, context.now_ns, expected)
-        elif self._doubted:
-            why = self._subject.doubted
-        else:
-            why = "never seen with a known range"
-        return f"lost {self._subject.phrase} for {self._unseen_s:.1f} s: {why}"
+                self._tracking.turn_to(target, context)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:
@@ -287,8 +248,8 @@ class FollowBehaviour(Behaviour):
     @property
     def status(self) -> str:
         if self._object is None:
-            return f"looking for {self._subject.phrase}"
+            return f"looking for {self.subject.phrase}"
         hidden = f", unseen for {self._unseen_s:.1f} s" if self._unseen_s > UNSEEN_S else ""
         return (
-            f"following {self._subject.phrase_now(self._object.track_id)}, {self._range_m:.1f} m away{hidden}"
+            f"following {self.subject.phrase_now(self._object.track_id)}, {self._range_m:.1f} m away{hidden}"
         )

@@ -11,12 +11,11 @@ from typing import Annotated
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import (
+    SUBJECT_KEYS,
     BuildContext,
-    ClassName,
     Command,
     GrammarError,
     Number,
-    TrackId,
     behaviour,
     both_of,
 )
@@ -35,12 +34,7 @@ class Gimbal(Command):
         float, Number("pitch", "deg", -90.0, 90.0, "above the horizon; below is negative")
     ] = 0.0
     yaw_deg: Annotated[float, Number("yaw", "deg", -180.0, 180.0, "clockwise from the nose")] = 0.0
-    track_id: Annotated[
-        int | None, TrackId("track", "keep it on this track until it is lost, instead of pitch and yaw")
-    ] = None
-    class_name: Annotated[
-        str | None, ClassName("class", "keep it on the best object of this class, until none is seen")
-    ] = None
+    subject: Subject | None = None
     latitude_deg: Annotated[
         float | None,
         Number("latitude", "deg", -90.0, 90.0, "of a place to keep it on, WGS 84; needs longitude"),
@@ -57,8 +51,7 @@ class Gimbal(Command):
         place = (self.latitude_deg, self.longitude_deg, self.altitude_m)
         given = {
             "pitch and yaw": bool(self.pitch_deg or self.yaw_deg),
-            "track": self.track_id is not None,
-            "class": self.class_name is not None,
+            SUBJECT_KEYS: self.subject is not None,
             "latitude and longitude": place != (None, None, None),
         }
         if sum(given.values()) > 1:
@@ -70,8 +63,8 @@ class Gimbal(Command):
     @property
     def aim(self) -> GimbalGoal:
         """Where to point it."""
-        if self.track_id is not None or self.class_name is not None:
-            return Subject(self.class_name or "", self.track_id)
+        if self.subject is not None:
+            return self.subject
         if self.latitude_deg is not None and self.longitude_deg is not None:
             return GlobalPoint(self.latitude_deg, self.longitude_deg, self.altitude_m or 0.0)
         return GimbalAim(math.radians(self.pitch_deg), math.radians(self.yaw_deg))
@@ -91,9 +84,13 @@ class PointGimbalBehaviour(HoldBehaviour):
         self._goal, self._pointing = goal, Pointing(goal)
         self._problem: str | None = None
         if isinstance(goal, Subject):
-            self.track_id, self.class_names = goal.track_id, goal.class_names
+            self.subject = goal
         elif isinstance(goal, GimbalAim):
             self.gimbal_pitches_rad = (goal.pitch_rad,)
+
+    @property
+    def needs(self) -> frozenset[Requirement]:
+        return self.requirements  # a direction is enough
 
     def on_activate(self, context: BehaviourContext) -> None:
         super().on_activate(context)

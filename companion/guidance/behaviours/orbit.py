@@ -11,19 +11,14 @@ from companion.guidance.behaviour import (
     BehaviourOutput,
     Outcome,
     Requirement,
-    needs_to_see,
 )
 from companion.guidance.command import (
     BuildContext,
-    ClassName,
     Command,
     EnumArgument,
     GrammarError,
-    MarkerId,
     Number,
-    TrackId,
     behaviour,
-    both_of,
 )
 from companion.guidance.motion import (
     STOPPING_MPS2,
@@ -35,7 +30,6 @@ from companion.guidance.motion import (
     stopping_speed,
 )
 from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
@@ -80,19 +74,13 @@ MAX_CENTRIPETAL_MPS2 = 2.0
     "orbit", "circle, nose to the centre: the point `radius` ahead, an object of a class, a track or a marker"
 )
 class Orbit(Command):
-    class_name: Annotated[str, ClassName("class", "object to circle about, optional")] = ""
+    subject: Subject | None = None
     radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 100.0, "how many; 0: until another command")] = 0.0
     direction: Annotated[
         str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
     ] = "clockwise"
-    track_id: Annotated[
-        int | None, TrackId("track", "circle about this track's object, instead of a class")
-    ] = None
-    marker_id: Annotated[int | None, MarkerId("marker", "circle about this marker, instead of a class")] = (
-        None
-    )
 
     @property
     def endless(self) -> bool:
@@ -100,9 +88,6 @@ class Orbit(Command):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = {"class": self.class_name or None, "track": self.track_id, "marker": self.marker_id}
-        if len(keys := [key for key, value in given.items() if value is not None]) > 1:
-            raise GrammarError(f"orbit: give either class or track or marker, got {both_of(keys)}")
         fastest = math.sqrt(MAX_CENTRIPETAL_MPS2 * self.radius_m)
         if self.speed_mps > fastest:
             raise GrammarError(
@@ -117,9 +102,7 @@ class Orbit(Command):
             self.speed_mps,
             self.laps,
             clockwise=clockwise,
-            class_name=self.class_name,
-            track_id=self.track_id,
-            marker_id=self.marker_id,
+            subject=self.subject,
         )
 
 
@@ -130,12 +113,13 @@ class OrbitBehaviour(Behaviour):
     and heading compensate any delays of the vehicle. It flies slower where the envelope would not let it keep
     the radius.
 
-    The centre is the point `radius_m` ahead of the vehicle at the start or, with a class name, a track or a
-    marker, where the object is: the circle moves with it, on top of `speed_mps`. A moving object that is lost
-    ends the orbit; one that stands is circled unseen.
+    The centre is the point `radius_m` ahead of the vehicle at the start or, with a subject, where the object
+    is: the circle moves with it, on top of `speed_mps`. A moving object that is lost ends the orbit; one that
+    stands is circled unseen.
     """
 
     name = "orbit"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
     def __init__(
         self,
@@ -144,23 +128,13 @@ class OrbitBehaviour(Behaviour):
         laps: float = 0.0,
         *,
         clockwise: bool = True,
-        class_name: str = "",
-        track_id: int | None = None,
-        marker_id: int | None = None,
+        subject: Subject | None = None,
     ) -> None:
-        needs = {Requirement.POSITION, Requirement.IN_AIR}
-        self._subject = None
-        if class_name or track_id is not None or marker_id is not None:
-            self._subject = Subject(class_name, track_id, marker_id)
-            needs |= needs_to_see(self._subject)
-        self.requirements = frozenset(needs)
-        self.class_names, self.track_id = ((class_name,) if class_name else ()), track_id
+        self.subject = subject
         self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
         self._turn = 1.0 if clockwise else -1.0
         self._centre: Vector3 | None = None
-        self._object: TrackedObject | None = None
         self._drift_mps = (0.0, 0.0)
-        self._begun_ns = 0
         self._down_m = 0.0
         self._angle_rad: float | None = None
         self._flown_rad = 0.0
@@ -177,15 +151,15 @@ class OrbitBehaviour(Behaviour):
         self._asked_mps = (0.0, 0.0)
         self._bias = VelocityBias()
         self._centre, self._drift_mps = None, (0.0, 0.0)
-        if self._subject is None:
+        if self.subject is None:
             self._centre = (
                 position[0] + self._radius_m * math.cos(yaw_rad),
                 position[1] + self._radius_m * math.sin(yaw_rad),
                 position[2],
             )
         else:
-            context.objects.forget(self._subject)
-        self._object, self._begun_ns, self._until_ns = None, context.now_ns, math.inf
+            context.objects.forget(self.subject)
+        self._until_ns = math.inf
 
     def _begin_circle(self, centre: Vector3, position: Vector3, context: BehaviourContext) -> None:
         path_m = self._laps * math.tau * self._radius_m
@@ -196,21 +170,14 @@ class OrbitBehaviour(Behaviour):
 
     def _observe(self, context: BehaviourContext) -> str | None:
         """Move the centre with the object. Returns why that is not possible, in words; None: it is."""
-        subject, now_ns = self._subject, context.now_ns
+        subject, now_ns = self.subject, context.now_ns
         if subject is None:
             return None
         seen = context.objects.of(subject)
-        if seen is None or seen.position_ned_m is None:
-            if context.objects.shows(subject) and now_ns - self._begun_ns <= LOOK_S * 1e9:
-                return None
-            return f"no localized {subject.name!r} to orbit"
-        before, self._object = self._object, seen
-        if before is not None:
-            self.add_notes(*subject.new_id(before.track_id, seen.track_id))
-        unseen_s = seen.unseen_s(now_ns)
-        if seen.moving and unseen_s > LOST_AFTER_S:
-            speed_mps = math.hypot(*seen.velocity_ned_mps)
-            return f"lost {subject.phrase} for {unseen_s:.1f} s: it moved at {speed_mps:.1f} m/s"
+        if seen is None:
+            return context.objects.missing(subject) or context.objects.lost(subject, LOOK_S)
+        if seen.moving and (why := context.objects.lost(subject, LOST_AFTER_S)) is not None:
+            return why
         self._centre = seen.position_at(now_ns)
         self._drift_mps = seen.velocity_ned_mps if seen.moving else (0.0, 0.0)
         return None

@@ -235,7 +235,7 @@ class PatrolBehaviour(Behaviour):
         self, found: TrackedObject, distance_m: float, context: BehaviourContext
     ) -> BehaviourOutput:
         self._approach = ApproachBehaviour(
-            found.class_name,
+            Subject(found.class_name),
             distance_m=distance_m,
             speed_mps=min(self._speed_mps, 3.0),
             confidence=min(0.3, self._confidence),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from companion.guidance.behaviour import (
     Behaviour,
@@ -11,18 +11,15 @@ from companion.guidance.behaviour import (
     BehaviourOutput,
     Outcome,
     Requirement,
-    needs_to_see,
 )
 from companion.guidance.behaviours.approach import LOST_AFTER_S
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import (
     BuildContext,
-    ClassName,
     Command,
     FileName,
     GrammarError,
     Number,
-    TrackId,
     behaviour,
 )
 from companion.guidance.motion import Arrival, position_and_yaw, speed_of
@@ -57,14 +54,12 @@ LOOK_S = 10.0
 
 @behaviour("policy", "fly to an object by a trained policy and stop before it")
 class Policy(Command):
-    either: ClassVar[tuple[str, ...]] = ("class", "track")
     file: Annotated[str, FileName("file", "an ONNX file on the service's computer, or a bundled policy")]
-    class_name: Annotated[str, ClassName("class", "what to fly to")] = ""
+    subject: Subject
     distance_m: Annotated[
         float, Number("distance", "m", 1.0, 100.0, "where to stop, over ground to its nearest surface")
     ] = 5.0
     limit_s: Annotated[float, Number("limit", "s", 1.0, 3600.0, "give up after this long")] = 120.0
-    track_id: Annotated[int | None, TrackId("track", "fly to this track, instead of a class")] = None
 
     def build(self, context: BuildContext) -> Behaviour:
         try:
@@ -76,8 +71,7 @@ class Policy(Command):
                     f"{loaded.name} steps at {rate_hz:g} Hz, guidance only at {loop_hz:g} Hz: "
                     "set guidance.rate_hz to at least that of the policy"
                 )
-            wanted = Subject(self.class_name, self.track_id)
-            return PolicyBehaviour(loaded, wanted, distance_m=self.distance_m, limit_s=self.limit_s)
+            return PolicyBehaviour(loaded, self.subject, distance_m=self.distance_m, limit_s=self.limit_s)
         except PolicyError as error:
             raise GrammarError(f"policy: {error}") from error
 
@@ -114,19 +108,19 @@ class PolicyBehaviour(Behaviour):
 
     Args:
         policy: checked by `check_quantities`.
-        wanted: the object. distance_m: where to stop, over ground to its surface. limit_s: longest duration.
+        subject: the object. distance_m: where to stop, over ground to its surface. limit_s: longest duration.
 
     Raises:
         PolicyError: it was not trained for this distance.
     """
 
     name = "policy"
+    requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
-    def __init__(self, policy: LoadedPolicy, wanted: Subject, *, distance_m: float, limit_s: float) -> None:
-        self._policy, self._wanted = policy, wanted
+    def __init__(self, policy: LoadedPolicy, subject: Subject, *, distance_m: float, limit_s: float) -> None:
+        self._policy = policy
+        self.subject: Subject = subject
         self._distance_m, self._limit_s = distance_m, limit_s
-        self.requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR}) | needs_to_see(wanted)
-        self.class_names, self.track_id = wanted.class_names, wanted.track_id
         trained = next(q for q in policy.description.observation if q.name == "distance_wanted_m")
         if not trained.low <= distance_m <= trained.high:
             raise PolicyError(
@@ -142,25 +136,23 @@ class PolicyBehaviour(Behaviour):
     def on_activate(self, context: BehaviourContext) -> None:
         self._arrival = Arrival()
         self._object = self._hold = None
-        context.objects.forget(self._wanted)
+        context.objects.forget(self.subject)
         self._begun_ns = self._due_ns = context.now_ns
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         position, yaw_rad = position_and_yaw(context.state)
         elapsed_s = (context.now_ns - self._begun_ns) / 1e9
-        seen = self._observed(context)
+        self._object = seen = context.objects.of(self.subject, CONFIDENCE)
         if seen is None:
-            if elapsed_s > LOOK_S:
-                why = "range never known" if context.perception_fresh else "no detections received"
-                why = context.perception_fault(why)
-                return Outcome(False, f"no {self._wanted.name} to fly to in {elapsed_s:.0f} s: {why}")
+            if (why := context.objects.lost(self.subject, LOOK_S)) is not None:
+                return Outcome(False, why)
             return self._wait(dt_s, context)
         values = self._observation(seen, context, position, yaw_rad)
         self._range_m = math.hypot(values["target_forward_m"], values["target_right_m"])
         at_m = abs(self._range_m - self._distance_m)
         lost = values["target_age_s"] > LOST_AFTER_S
         if not lost and self._arrival.update(at_m, speed_of(context.state), context.now_ns):
-            return Outcome(True, f"reached {self._wanted.name} at {self._range_m:.1f} m")
+            return Outcome(True, f"reached {self.subject.name} at {self._range_m:.1f} m")
         if elapsed_s > self._limit_s:
             return Outcome(False, f"not there after {elapsed_s:.0f} s: {self._range_m:.1f} m away")
         if (fault := self._untrained(values)) is not None:
@@ -185,13 +177,6 @@ class PolicyBehaviour(Behaviour):
             self._hold, self._arrival = HoldBehaviour(), Arrival()
             self._hold.on_activate(context)
         return self._hold.update(dt_s, context)
-
-    def _observed(self, context: BehaviourContext) -> TrackedObject | None:
-        """The object; None: none with a known range yet."""
-        seen = context.objects.of(self._wanted, CONFIDENCE)
-        if seen is not None and seen.position_ned_m is not None:
-            self._object = seen
-        return self._object
 
     def _observation(
         self, seen: TrackedObject, context: BehaviourContext, position: Vector3, yaw_rad: float
@@ -231,10 +216,10 @@ class PolicyBehaviour(Behaviour):
     @property
     def status(self) -> str:
         if self._object is None:
-            return f"policy {self._policy.name}, looking for {self._wanted.phrase}"
+            return f"policy {self._policy.name}, looking for {self.subject.phrase}"
         if self._hold is not None:
-            return f"policy {self._policy.name}, lost {self._wanted.phrase}, waiting"
-        return f"policy {self._policy.name}, {self._wanted.name} {self._range_m:.1f} m away"
+            return f"policy {self._policy.name}, lost {self.subject.phrase}, waiting"
+        return f"policy {self._policy.name}, {self.subject.name} {self._range_m:.1f} m away"
 
 
 def _clipped(quantity: Quantity, value: float) -> float:

@@ -6,8 +6,9 @@ import math
 
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.motion import home_of, local_from_global
-from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject, newest_of
-from companion.guidance.objects.target import Target
+from companion.guidance.objects.in_view import nearest_ahead
+from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from companion.vehicle.state import Vector3, VehicleState
 
@@ -31,7 +32,7 @@ class Pointing:
     def __init__(self, goal: GimbalGoal) -> None:
         self.goal = goal
         self.aim = goal if isinstance(goal, GimbalAim) else None
-        self._seen: Target | None = None
+        self._object: TrackedObject | None = None
         self._point: Vector3 | None = None
         self._known_ns = 0
 
@@ -51,7 +52,8 @@ class Pointing:
             case GimbalAim():
                 return None
             case Subject():
-                why = _not_in_sight(self.goal, context)
+                if (why := context.objects.missing(self.goal)) is None:
+                    self._object = self._best(self.goal, context)
             case GlobalPoint():
                 why = self._locate(self.goal, context) or self._beyond_reach(context)
         why = why or self.update(context)
@@ -75,16 +77,24 @@ class Pointing:
             self.aim = GimbalAim(pitch_rad, bearing_rad, YawFrame.NORTH)
         return None
 
-    def _look(self, wanted: Subject, context: BehaviourContext) -> None:
-        """Remember the object's newest detection, and where that was."""
-        now_ns, state = context.now_ns, context.state
-        target = newest_of(wanted, self._seen, context.targets, context.tracks, now_ns)
-        if target is None or (self._seen is not None and target.captured_ns <= self._seen.captured_ns):
+    def _look(self, subject: Subject, context: BehaviourContext) -> None:
+        """Remember the object's newest detection, and where that was, by the newest range and direction."""
+        before, here = self._object, context.state.position_ned_m
+        if before is None:
             return
-        self._seen, self._known_ns, self._point = target, target.captured_ns, None
-        if target.position_ned_m is not None and state.position_ned_m is not None:
-            down = state.position_ned_m[2] - target.ground_range_m * math.tan(target.elevation_rad)
+        self._object = seen = context.objects.now(before)
+        if subject.class_name and seen.unseen_s(context.now_ns) > context.objects.ended_s:
+            self._object = seen = self._best(subject, context) or seen
+        if self._known_ns == seen.last_ns:
+            return
+        self._known_ns, self._point, target = seen.last_ns, None, seen.detection
+        if target.position_ned_m is not None and here is not None:
+            down = here[2] - target.ground_range_m * math.tan(target.elevation_rad)
             self._point = (*target.position_ned_m[:2], down)
+
+    def _best(self, subject: Subject, context: BehaviourContext) -> TrackedObject | None:
+        present = context.objects.present(subject)
+        return nearest_ahead(present, context.objects.yaw_rad) if present else None
 
     def _locate(self, place: GlobalPoint, context: BehaviourContext) -> str | None:
         state = context.state
@@ -114,7 +124,9 @@ class Pointing:
         """Bearing from north and elevation, radians; None: unchanged."""
         here = _position_ahead(context.state, context.now_ns)
         if self._point is None:
-            return None if self._seen is None else (self._seen.bearing_rad, self._seen.elevation_rad)
+            if self._object is None:
+                return None
+            return self._object.detection.bearing_rad, self._object.detection.elevation_rad
         if here is None:
             return None
         north, east, down = (there - own for there, own in zip(self._point, here, strict=True))
@@ -124,24 +136,9 @@ class Pointing:
         return bearing_rad, math.atan2(-down, range_m)
 
     def _lost(self, context: BehaviourContext) -> str:
-        if self._seen is None:
+        if self._object is None:
             return f"position lost for {LOST_AFTER_S:.1f} s"
-        instead = context.tracks.replacement(self._seen, context.now_ns) if self._is_track else ""
-        return f"lost {self.name} for {LOST_AFTER_S:.1f} s{instead}"
-
-    @property
-    def _is_track(self) -> bool:
-        return isinstance(self.goal, Subject) and self.goal.track_id is not None
-
-
-def _not_in_sight(wanted: Subject, context: BehaviourContext) -> str | None:
-    if wanted.track_id is not None:
-        return context.tracks.missing(wanted.track_id, context.now_ns)
-    if newest_of(wanted, None, context.targets, context.tracks, context.now_ns) is not None:
-        return None
-    if not context.perception_fresh:
-        return context.perception_fault("no fresh detections of the steering camera")
-    return f"no confirmed {wanted.name} in the image"
+        return f"lost {self.name} for {LOST_AFTER_S:.1f} s: {context.objects.where(self._object)}"
 
 
 def _position_missing(context: BehaviourContext) -> str:

@@ -67,7 +67,7 @@ NO_MINIMUM = BatteryMinimum()
 def needs_charge(behaviour: Behaviour) -> bool:
     """Whether a behaviour keeps flying, so that the minimum applies: not landing, returning and stopping."""
     flies = {Requirement.BATTERY, Requirement.POSITION, Requirement.ON_GROUND}
-    return not behaviour.requirements.isdisjoint(flies)
+    return not behaviour.needs.isdisjoint(flies)
 
 
 def fresh_charge(state: VehicleState, now_ns: int) -> float | None:

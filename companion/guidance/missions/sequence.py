@@ -114,17 +114,16 @@ class SequenceBehaviour(Behaviour):
         self._ended = False
         self._goal_ned_m: Vector3 | None = None
         self.later = tuple(step.make() for step in plan.steps)
-        self.class_names = tuple(sorted({name for step in self.later for name in step.class_names}))
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
         """Of the current step, before the start of the first one; `later` has all steps."""
         if self._active is not None:
-            return self._active.requirements
+            return self._active.needs
         if self._first is None:
             return frozenset()
         branches = self._plan.steps[0].on_failure != ABORT
-        return self._first.requirements - (OF_THE_MOMENT if branches else frozenset())
+        return self._first.needs - (OF_THE_MOMENT if branches else frozenset())
 
     def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
         """See Behaviour: as its first step."""

@@ -149,6 +149,15 @@ class ObjectTable:
 
     Attributes:
         objects: what `update` returned.
+
+    >>> from companion import ObjectTable
+    >>> from companion.guidance.objects.target import Target
+    >>> table, here = ObjectTable(), (0.0, 0.0, -2.0)
+    >>> first = Target("car", 0.9, 0, 0.0, -0.2, 10.0, position_ned_m=(10.0, 0.0, 0.0), track_id=3)
+    >>> [car] = table.update([first], here, 0)
+    >>> [unseen] = table.update([], here, 100_000_000)
+    >>> car.track_id, car.occluded, unseen.object_id == car.object_id, unseen.occluded
+    (3, False, True, True)
     """
 
     def __init__(self) -> None:
@@ -169,18 +178,14 @@ class ObjectTable:
             captured_ns: of the frame.
 
         Returns:
-            Those of this frame, and the confirmed ones of the last `LONGEST_S`, the oldest first, each as of
-            its newest detection.
+            Those of the last `LONGEST_S`, and the confirmed ones of the last `FORGET_S`, the oldest first,
+            each as of its newest detection.
         """
         if captured_ns > self._newest_ns and all(map(math.isfinite, vehicle)):
             self._newest_ns = captured_ns
             _Frame(self, targets, vehicle, captured_ns).associate()
             self._forget()
-            self.objects = tuple(
-                each.value(captured_ns)
-                for each in self._objects.values()
-                if each.last_ns == captured_ns or (each.confirmed and each.unseen_s(captured_ns) <= LONGEST_S)
-            )
+            self.objects = tuple(each.value(captured_ns) for each in self._objects.values())
         return self.objects
 
     def of_track(self, track_id: int) -> TrackedObject | None:

@@ -38,6 +38,13 @@ class TrackedObject:
         doubt: share of its detections since it was first confirmed in which it was ambiguous, 0..1.
         occluded: it is not in the newest frame.
         detection: its newest detection.
+
+    >>> from companion import ObjectTable, TrackedObject
+    >>> from companion.guidance.objects.target import Target
+    >>> seen = Target("car", 0.9, 0, 0.0, -0.2, 10.0, position_ned_m=(10.0, 0.0, 0.0), track_id=3)
+    >>> [car] = ObjectTable().update([seen], (0.0, 0.0, -2.0), seen.captured_ns)
+    >>> isinstance(car, TrackedObject), car.track_ids, car.position_at(500_000_000), car.unseen_s(500_000_000)
+    (True, (3,), (10.0, 0.0, 0.0), 0.5)
     """
 
     object_id: int

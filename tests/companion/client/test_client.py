@@ -24,7 +24,7 @@ from companion.bus.listeners import Listener
 from companion.bus.session import Bus
 from companion.client import CommandFailedError, Drone, NoAnswerError, Stream
 from companion.client.commands import Commands, Reply
-from companion.guidance.command import COMMANDS, arguments_of
+from companion.guidance.command import COMMANDS, arguments_of, value_of
 from companion.guidance.grammar import parse
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -148,7 +148,7 @@ async def test_texts_of_methods_are_valid_commands(kind: Any) -> None:
     command = parse((await method(**arguments))["command"])
     assert type(command) is kind
     values = {key.removesuffix("_"): value for key, value in arguments.items()}
-    given = {argument.key: getattr(command, field.name) for field, argument in arguments_of(kind)}
+    given = {argument.key: value_of(command, part) for part, argument in arguments_of(kind)}
     assert {key: given[key] for key in values} == values
 
 

@@ -441,6 +441,7 @@ class Flight:
     Attributes:
         steps: outputs of the behaviour in OFFBOARD, the last one its outcome.
         track: positions of the vehicle.
+        notes: the behaviour's, and those of its objects.
     """
 
     behaviour: Behaviour
@@ -453,6 +454,7 @@ class Flight:
     latency_s: float = 0.1
     steps: list[BehaviourOutput] = field(default_factory=list)
     track: list[tuple[float, float, float]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
     def run(
         self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
@@ -482,6 +484,7 @@ class Flight:
                 command = harness.command(recording)
             harness.run()
             self.track.append(self.vehicle.position_ned_m)
+            self.notes = [event.message for event in harness.events if event.kind is EventKind.NOTED]
             if command.done():
                 return command.result()
         return None

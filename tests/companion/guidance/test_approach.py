@@ -4,6 +4,7 @@ import random
 import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import RangeSource
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -18,7 +19,7 @@ def test_approach_stops_at_the_distance_without_overshoot(north: float, east: fl
     car = SeenObject("car", north, east)
     vehicle = KinematicVehicle()
     nearest = []
-    flight = Flight(ApproachBehaviour("car", distance_m=5.0), vehicle, [car])
+    flight = Flight(ApproachBehaviour(Subject("car"), distance_m=5.0), vehicle, [car])
     outcome = flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car)))
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -33,7 +34,7 @@ def test_approach_arrives_with_noisy_ranges() -> None:
     noise = random.Random(7)
     car = SeenObject("car", 25.0, -6.0)
     vehicle = KinematicVehicle()
-    flight = Flight(ApproachBehaviour("car"), vehicle, [car], noise=lambda: noise.gauss(0.0, 0.06))
+    flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=lambda: noise.gauss(0.0, 0.06))
     outcome = flight.run(120.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
@@ -43,7 +44,7 @@ def test_approach_arrives_with_noisy_ranges() -> None:
 def test_approach_retreats_when_it_starts_too_near() -> None:
     person = SeenObject("person", 2.0, 0.0)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("person", distance_m=4.0), vehicle, [person]).run(60.0)
+    outcome = Flight(ApproachBehaviour(Subject("person"), distance_m=4.0), vehicle, [person]).run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
@@ -56,7 +57,7 @@ def test_approach_keeps_its_object_when_a_nearer_appears() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         second.visible = seconds > 2.0
 
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [first, second]).run(90.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [first, second]).run(90.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
@@ -70,7 +71,7 @@ def test_approach_follows_a_walking_object() -> None:
             person.east = 0.8 * seconds
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("person"), vehicle, [person]).run(90.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("person")), vehicle, [person]).run(90.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
@@ -86,7 +87,7 @@ def test_approach_brakes_and_ends_when_target_lost() -> None:
         if seconds > 9.0:
             stopped_at.append(vehicle.position[0])
 
-    outcome = Flight(ApproachBehaviour("car", lost_timeout_s=6.0), vehicle, [car]).run(60.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("car"), lost_timeout_s=6.0), vehicle, [car]).run(60.0, each)
     assert_failed(outcome, "lost the ", "car ")
     assert max(stopped_at) - min(stopped_at) < 0.2
 
@@ -98,13 +99,13 @@ def test_approach_continues_when_object_reappears() -> None:
         car.visible = not 4.0 < seconds < 7.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(90.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(90.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
 
 
 def test_silent_detector_brakes_and_ends_approach() -> None:
-    flight = Flight(ApproachBehaviour("car"), objects=[SeenObject("car", 40.0, 0.0)])
+    flight = Flight(ApproachBehaviour(Subject("car")), objects=[SeenObject("car", 40.0, 0.0)])
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 4.0
@@ -119,7 +120,7 @@ def test_silent_detector_brakes_and_ends_approach() -> None:
 def test_approach_without_range_only_yaws() -> None:
     car = SeenObject("car", 20.0, 12.0, with_range=False)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0)
     assert outcome is not None
     assert not outcome.success
     assert "range" in outcome.reason
@@ -134,7 +135,7 @@ def test_approach_finishes_on_bearings_when_range_is_lost() -> None:
         car.with_range = distance_to(vehicle, car) > 7.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [car]).run(60.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.5)
@@ -149,7 +150,7 @@ def test_wrong_first_range_does_not_lose_the_object(source: RangeSource) -> None
         return wrong.pop() if wrong else 0.0
 
     vehicle = KinematicVehicle()
-    flight = Flight(ApproachBehaviour("car"), vehicle, [car], noise=noise)
+    flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=noise)
     outcome = flight.run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason

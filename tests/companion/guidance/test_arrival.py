@@ -25,6 +25,7 @@ from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
+from companion.guidance.objects.subject import Subject
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.attitude import wrap_angle
@@ -150,7 +151,7 @@ def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
     seeing = SyntheticCamera(camera_settings(camera, mount), detect=detector, rate_hz=5.0)
     flight = LockstepFlight.airborne(height_m=2.5, camera=lambda _: seeing, **air(name, seed))
     flight.turn_to(math.atan2(3.0, 15.0))
-    outcome, hold = then_hold(flight, ApproachBehaviour("car", distance_m=5.0))
+    outcome, hold = then_hold(flight, ApproachBehaviour(Subject("car"), distance_m=5.0))
     assert outcome.goal_ned_m is not None
     assert_arrived(outcome, hold, outcome.goal_ned_m, name)
     assert car.range_m(outcome.goal_ned_m, 0.0) == pytest.approx(5.0, abs=0.5)

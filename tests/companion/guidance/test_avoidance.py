@@ -16,6 +16,7 @@ from companion.guidance.behaviours.patrol import PatrolBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput
 from companion.guidance.limits.obstacles import ObstacleRules
+from companion.guidance.objects.subject import Subject
 from companion.recording.encoding import decode, encode
 from companion.settings.reading import ConfigurationError, load_settings
 from tests.companion.guidance.guidance_harness import STEP_S, GuidanceHarness, assert_failed, flying
@@ -129,7 +130,7 @@ def test_approach_flies_the_planned_path_to_a_hidden_object() -> None:
 
     harness = harness_with(seen, objects=[car])
     harness.run(0.1)
-    pending = harness.command(ApproachBehaviour("car", distance_m=5.0))
+    pending = harness.command(ApproachBehaviour(Subject("car"), distance_m=5.0))
     aside: list[float] = []
     while not pending.done() and len(aside) < 1000:
         harness.run()

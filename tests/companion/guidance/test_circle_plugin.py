@@ -16,19 +16,22 @@ from companion.guidance.command import COMMANDS
 EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
 
 
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def installed_package(example: Path, folder: Path) -> Path:
     """A folder with the package, as pip installs it."""
     pytest.importorskip("setuptools")
-    folder = tmp_path_factory.mktemp("circle")
     source, target = folder / "source", folder / "site"
     source.mkdir()
-    for file in EXAMPLE.iterdir():
+    for file in example.iterdir():
         if file.is_file():
             (source / file.name).write_bytes(file.read_bytes())
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation"]
     subprocess.run([*pip, "--no-index", "--target", str(target), str(source)], check=True, timeout=100)
     return target
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return installed_package(EXAMPLE, tmp_path_factory.mktemp("circle"))
 
 
 def test_example_has_at_most_forty_lines() -> None:

@@ -139,7 +139,7 @@ def test_other_marker_and_one_seen_briefly_are_not_flown_to() -> None:
     log = flight_with(glimpse).fly("approach marker=7 lost_timeout=2", 20.0)
     assert UNCONFIRMED_MARKER in reason(log)
     unseen = flight_with(lambda _: FAR_AWAY, rate_hz=5.0)
-    assert "no localized 'marker 7'" in reason(unseen.fly("orbit marker=7", 20.0))
+    assert "no confirmed marker 7" in reason(unseen.fly("orbit marker=7", 20.0))
 
 
 def test_marker_needs_detection_with_the_steering_camera() -> None:
@@ -174,6 +174,8 @@ def test_bad_commands_name_the_argument(text: str, words: list[str]) -> None:
 def test_command_round_trip(text: str) -> None:
     command = parse(text)
     assert str(command) == text
-    assert command.build(NO_CONTEXT).class_names == ()
+    behaviour = command.build(NO_CONTEXT)
+    assert behaviour.subject is not None
+    assert (behaviour.subject.marker_id, behaviour.subject.class_names) == (int(text[-1]), ())
     marker = json_schema()["$defs"][text.split()[0]]["properties"]["marker"]
     assert (marker["type"], marker["minimum"], marker["maximum"]) == ("integer", 0, 1023)

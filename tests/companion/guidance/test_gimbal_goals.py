@@ -202,6 +202,7 @@ def test_place_out_of_the_gimbals_reach_is_refused() -> None:
     ("text", "goal"),
     [
         ("gimbal class=person", Subject("person")),
+        ("gimbal marker=7", Subject(marker_id=7)),
         ("gimbal latitude=47.5 longitude=-8.25", GlobalPoint(47.5, -8.25, 0.0)),
         ("gimbal latitude=47.5 longitude=8 altitude=-20m", GlobalPoint(47.5, 8.0, -20.0)),
         ("gimbal latitude=0 longitude=0", GlobalPoint(0.0, 0.0, 0.0)),
@@ -237,7 +238,7 @@ def test_refused_command_gives_the_reason() -> None:
     assert "no confirmed person" in refused(flight, "gimbal class=person")
     flight.cameras = ()
     flight.run(1.0)
-    assert "no fresh detections" in refused(flight, "gimbal class=person")
+    assert "no detections received" in refused(flight, "gimbal class=person")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from companion.guidance import (
 )
 from companion.guidance.command import COMMANDS, NO_CONTEXT, Command, GrammarError, arguments_of
 from companion.guidance.grammar import describe, parse
+from companion.guidance.objects.subject import Subject
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
 
@@ -34,13 +35,13 @@ NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic l
         ("TAKEOFF 5", Takeoff(5.0)),
         ("seek car", Seek("car")),
         ("seek class=car laps=1", Seek("car", laps=1.0)),
-        ("approach person distance=3", Approach("person", distance_m=3.0)),
+        ("approach person distance=3", Approach(Subject("person"), distance_m=3.0)),
         ("orbit radius=10 speed=2", Orbit(radius_m=10.0, speed_mps=2.0)),
         (
             "orbit radius=10m speed=2m/s direction=counterclockwise",
-            Orbit("", 10.0, 2.0, 0.0, "counterclockwise"),
+            Orbit(None, 10.0, 2.0, 0.0, "counterclockwise"),
         ),
-        ("orbit car radius=8", Orbit("car", 8.0)),
+        ("orbit car radius=8", Orbit(Subject("car"), 8.0)),
         ("hold", Hold()),
         ("  land \n", Land()),
         ("rtl", Rtl()),
@@ -50,7 +51,7 @@ NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic l
         ("seek Traffic-Light", Seek("traffic light")),
         ("seek traffic light", Seek("traffic light")),
         ("seek fire hydrant laps=3", Seek("fire_hydrant", laps=3.0)),
-        ('approach class="traffic light"', Approach("traffic light")),
+        ('approach class="traffic light"', Approach(Subject("traffic light"))),
         ("seek car sweep=-60deg sweep_rate=10", Seek("car", sweep_deg=-60.0, sweep_rate_dps=10.0)),
         ("gimbal pitch=-30", Gimbal(-30.0)),
         ("gimbal -30deg 15", Gimbal(-30.0, 15.0)),
@@ -130,11 +131,16 @@ def number(low: float, high: float) -> st.SearchStrategy[float]:
 class_names = st.text(st.characters(min_codepoint=32, max_codepoint=0x24F), min_size=1, max_size=20).filter(
     lambda name: name.strip() and name.isprintable()
 )
+subjects = (
+    st.builds(Subject, class_names)
+    | st.builds(Subject, track_id=st.integers(1, 2**63 - 1))
+    | st.builds(Subject, marker_id=st.integers(0, 1023))
+)
 directions = st.sampled_from(["clockwise", "counterclockwise"])
 orbits = st.tuples(number(1, 100), number(0.1, 1.0)).flatmap(
     lambda pair: st.builds(
         Orbit,
-        st.just("") | class_names,
+        st.none() | subjects,
         st.just(pair[0]),
         st.just(min(10.0, max(0.1, pair[1] * math.sqrt(2.0 * pair[0]) * 0.999))),
         number(0, 100),
@@ -156,7 +162,8 @@ commands = st.one_of(
         sweep_rate_dps=number(2, 60),
     ),
     st.builds(Gimbal, number(-90, 90), number(-180, 180)),
-    st.builds(Approach, class_names, number(1, 100), number(0.2, 10), number(0.05, 1), number(0.5, 60)),
+    st.builds(Gimbal, subject=subjects),
+    st.builds(Approach, subjects, number(1, 100), number(0.2, 10), number(0.05, 1), number(0.5, 60)),
     st.builds(
         Seek, class_names, pattern=st.just("square"), radius_m=number(1, 500), speed_mps=number(0.2, 20)
     ),
@@ -174,7 +181,7 @@ several_names = st.lists(
 )
 without_class_name = st.one_of(
     st.builds(Mission, class_names),
-    st.builds(Policy, class_names, class_names, number(1, 100), number(1, 3600)),
+    st.builds(Policy, class_names, subjects, number(1, 100), number(1, 3600)),
     st.builds(
         Patrol,
         st.sampled_from(["0,0 10,0", "0,0,5 9,9,8 -3,2"]),
@@ -205,6 +212,7 @@ def test_every_command_builds_a_behaviour_of_its_name(command: Command) -> None:
     assert behaviour.name == command.word
     name = getattr(command, "class_name", "")
     assert behaviour.class_names == ((name,) if name else ())
+    assert behaviour.subject == getattr(command, "subject", None)
 
 
 @given(st.text(max_size=60))
@@ -221,7 +229,8 @@ def test_any_text_is_a_command_or_a_one_line_error(text: str) -> None:
 
 def test_every_field_is_an_argument_of_the_grammar() -> None:
     for kind in COMMANDS.values():
-        assert len(arguments_of(kind)) == len(fields(kind))
+        parts = [part.of_subject or part.name for part, _ in arguments_of(kind)]
+        assert list(dict.fromkeys(parts)) == [field.name for field in fields(kind)]
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
 from companion.guidance.mode_control import Phase
+from companion.guidance.objects.subject import Subject
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
 from tests.companion.guidance.guidance_harness import (
@@ -183,5 +184,5 @@ def test_approach_retreats_from_an_approaching_object(speed_mps: float, nearest_
         car.north = 20.0 - speed_mps * seconds
         ranges.append(math.hypot(car.north - active.position[0], car.east - active.position[1]))
 
-    Flight(ApproachBehaviour("car", distance_m=5.0), vehicle, [car]).run(25.0, each)
+    Flight(ApproachBehaviour(Subject("car"), distance_m=5.0), vehicle, [car]).run(25.0, each)
     assert min(ranges) > nearest_m

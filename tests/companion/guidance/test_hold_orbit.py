@@ -7,6 +7,7 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.objects.subject import Subject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight
@@ -101,7 +102,7 @@ def test_orbit_flies_its_laps_facing_the_centre(clockwise: bool) -> None:
 def test_orbit_reaches_a_distant_circle() -> None:
     car = SeenObject("car", 30.0, 4.0)
     vehicle = KinematicVehicle()
-    flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, class_name="car"), vehicle, [car])
+    flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, subject=Subject("car")), vehicle, [car])
     # The behaviour begins after the first frame, as its requirement demands.
     flight.latency_s = 0.0
     outcome = flight.run(90.0)
@@ -111,7 +112,7 @@ def test_orbit_reaches_a_distant_circle() -> None:
 
 
 def test_orbit_without_a_visible_object_ends() -> None:
-    outcome = Flight(OrbitBehaviour(class_name="boat")).run(5.0)
+    outcome = Flight(OrbitBehaviour(subject=Subject("boat"))).run(5.0)
     assert outcome is not None
     assert not outcome.success
     assert "boat" in outcome.reason

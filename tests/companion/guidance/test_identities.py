@@ -7,6 +7,7 @@ import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import DOUBTED, RangeSource, Target
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -61,9 +62,9 @@ def test_track_id_at_an_impossible_position_is_another_object() -> None:
 
 def test_approach_ignores_unconfirmed_targets() -> None:
     ghost = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.6, trusted=False)
-    outcome = Flight(ApproachBehaviour("car"), objects=[ghost]).run(20.0)
+    outcome = Flight(ApproachBehaviour(Subject("car")), objects=[ghost]).run(20.0)
     assert outcome is not None
-    assert_failed(outcome, "lost the ", "car ")
+    assert_failed(outcome, "did not find ", "car ")
     assert outcome.reason.endswith(DOUBTED)
 
 
@@ -71,7 +72,7 @@ def test_approach_prefers_a_confirmed_target() -> None:
     ghost = SeenObject("car", 15.0, 0.0, track_id=1, track_score=0.6, trusted=False)
     car = SeenObject("car", 15.0, 6.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [ghost, car]).run(60.0)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [ghost, car]).run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.4)
@@ -87,7 +88,7 @@ def test_approach_is_not_diverted_by_a_passing_object() -> None:
         other.north = 28.0
         car.visible = not abs(other.east) < 1.2  # hidden while the other passes
 
-    outcome = Flight(ApproachBehaviour("car"), vehicle, [car, other]).run(90.0, each)
+    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car, other]).run(90.0, each)
     assert outcome is not None
     assert outcome.success, outcome.reason
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.5)
@@ -95,14 +96,14 @@ def test_approach_is_not_diverted_by_a_passing_object() -> None:
 
 def test_tracked_object_may_have_low_confidence() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.12, track_id=2, track_score=0.7)
-    outcome = Flight(ApproachBehaviour("car", confidence=0.3), objects=[car]).run(60.0)
+    outcome = Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(60.0)
     assert outcome is not None
     assert outcome.success, outcome.reason
 
 
 def test_one_good_frame_does_not_start_an_approach() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=2, track_score=0.2)
-    outcome = Flight(ApproachBehaviour("car", confidence=0.3), objects=[car]).run(20.0)
+    outcome = Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(20.0)
     assert outcome is not None
     assert not outcome.success
 

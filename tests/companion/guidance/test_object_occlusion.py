@@ -193,20 +193,21 @@ def test_changed_range_source_widens_the_gate(road: Road) -> None:
     assert road.off_m == pytest.approx(2.0, abs=0.7)
 
 
-def choose(frames: list[list[Target]]) -> TrackedObject | None:
-    """The car that is chosen by the last frame, nose to the north."""
+def choose(frames: list[list[Target]]) -> TrackedObject | Target | None:
+    """The car that is chosen by the last frame, nose to the north; without a range its detection."""
     table, found = ObjectTable(), None
     choices: dict[Subject, Choice] = {}
     for index, targets in enumerate(frames):
         now_ns = round((index + 1) * FRAME_S * 1e9)
         stamped = [replace(target, captured_ns=now_ns) for target in targets]
         objects = table.update(stamped, (0.0, 0.0, -4.0), now_ns)
-        found = ObjectsInView(objects, (), now_ns, 0.0, choices).of(Subject("car"))
+        in_view = ObjectsInView(objects, now_ns=now_ns, _choices=choices)
+        found = in_view.of(Subject("car")) or in_view.in_sight(Subject("car"))
     return found
 
 
 def test_often_ambiguous_object_is_not_chosen() -> None:
-    def chosen(doubts: str) -> TrackedObject | None:
+    def chosen(doubts: str) -> TrackedObject | Target | None:
         car = seen((20.0, 0.0), (0.0, 0.0, -4.0), 0.0, 3)
         return choose([[replace(car, trusted=doubt != "?")] for doubt in doubts])
 

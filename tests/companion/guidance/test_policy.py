@@ -226,7 +226,7 @@ def test_policy_goes_on_when_its_object_is_seen_again(write: Write) -> None:
 def test_policy_without_an_object_holds_then_ends_in_hold(write: Write) -> None:
     harness = GuidanceHarness(flying())
     outcome = harness.outcome(engaged(harness, built(write())), 15.0)
-    assert_failed(outcome, "no car to fly to in 10 s")
+    assert_failed(outcome, "did not find the car in 10.0 s")
     assert harness.events[-1].kind is EventKind.ENDED
     assert harness.events[-1].outcome == outcome
     harness.run(1.0)

@@ -16,6 +16,7 @@ from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.gimbal.pitch import GimbalSweep
+from companion.guidance.objects.subject import Subject
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from tests.companion.guidance.guidance_harness import (
@@ -117,7 +118,7 @@ def test_nothing_is_missing_and_no_sweep_needs_no_gimbal() -> None:
     )
 
 
-@pytest.mark.parametrize("behaviour", [SeekBehaviour("car"), ApproachBehaviour("car")])
+@pytest.mark.parametrize("behaviour", [SeekBehaviour("car"), ApproachBehaviour(Subject("car"))])
 def test_unknown_camera_direction_is_refused(
     behaviour: SeekBehaviour | ApproachBehaviour,
 ) -> None:

@@ -20,6 +20,7 @@ from companion.guidance.grammar import parse
 from companion.guidance.interface import CommandInput, EventKind, GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.guidance.objects.subject import Subject
 from companion.vehicle.state import FlightMode, LandedState
 from companion.vehicle.vehicle_type import VtolState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, engaged, flying, parked
@@ -292,7 +293,7 @@ def test_track_from_before_a_suspend_is_forgotten() -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=True)
     harness.run(1.1)
-    outcome = harness.command(ApproachBehaviour("", track_id=7)).result()
+    outcome = harness.command(ApproachBehaviour(Subject(track_id=7))).result()
     assert not outcome.success
 
 

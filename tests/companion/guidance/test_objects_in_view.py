@@ -1,0 +1,108 @@
+"""What a command's object is, and why there is none: `ObjectsInView`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
+from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.target import DOUBTED, Target
+
+HERE = (0.0, 0.0, -4.0)
+CAR, TRACK = Subject("car"), Subject(track_id=1)
+
+
+def car(north: float, east: float = 0.0, track_id: int = 1, **more: Any) -> Target:
+    seen = Target(
+        "car",
+        0.9,
+        0,
+        0.1 * east,
+        -0.3,
+        north,
+        position_ned_m=(north, east, 0.0),
+        track_id=track_id,
+        range_sigma_m=0.2,
+        across_sigma_m=0.1,
+    )
+    return replace(seen, **more)
+
+
+class Scene:
+    """A camera that is looked at ten times a second; `Subject` is chosen at each."""
+
+    def __init__(self, subject: Subject) -> None:
+        self.subject, self.now_ns = subject, 0
+        self.table, self.choices = ObjectTable(), dict[Subject, Choice]()
+        self.view = ObjectsInView()
+
+    def show(self, seconds: float, *targets: Target, **more: Any) -> ObjectsInView:
+        for _ in range(round(10 * seconds)):
+            self.now_ns += 100_000_000
+            stamped = [replace(target, captured_ns=self.now_ns) for target in targets]
+            self.view = ObjectsInView(
+                self.table.update(stamped, HERE, self.now_ns),
+                now_ns=self.now_ns,
+                here_ned_m=HERE,
+                _choices=self.choices,
+                **more,
+            )
+            self.view.of(self.subject)
+        return self.view
+
+
+@pytest.mark.parametrize(
+    ("targets", "more", "words"),
+    [
+        ([], {}, ["did not find the car in 2.", "never seen"]),
+        ([car(9.0, trusted=False)], {}, ["did not find", DOUBTED]),
+        ([car(9.0, position_ned_m=None, ground_range_m=float("nan"))], {}, ["known range"]),
+        ([], {"fault": "no detections received"}, ["did not find", "no detections received"]),
+    ],
+)
+def test_reason_where_nothing_was_chosen(
+    targets: list[Target], more: dict[str, Any], words: list[str]
+) -> None:
+    view = Scene(CAR).show(3.0, *targets, **more)
+    assert view.of(CAR) is None
+    why = view.lost(CAR, after_s=2.0)
+    assert why is not None
+    assert [word for word in words if word not in why] == []
+    assert view.lost(CAR, after_s=5.0) is None
+
+
+def test_reason_names_where_it_was_and_what_is_near() -> None:
+    scene = Scene(TRACK)
+    scene.show(2.0, car(9.0), car(9.0, 4.0, 2))
+    assert scene.view.lost(TRACK, after_s=0.5) is None
+    why = scene.show(3.0, car(9.0, 4.0, 2)).lost(TRACK, after_s=2.0)
+    assert why is not None
+    assert why.startswith("lost track 1 for 3.0 s: last seen 9.0 m away; track 2, a car, is 4.0 m")
+    why = scene.show(0.1, fault="camera frozen").lost(TRACK, after_s=2.0)
+    assert why is not None
+    assert why.endswith(": camera frozen")
+
+
+def test_object_is_chosen_after_a_while_and_kept() -> None:
+    scene = Scene(CAR)
+    assert scene.show(CHOOSING_S, car(9.0), car(20.0, 1.0, 2)).of(CAR) is None
+    chosen = scene.show(0.1, car(9.0), car(20.0, 1.0, 2)).of(CAR)
+    assert chosen is not None
+    assert chosen.track_id == 1
+    kept = scene.show(15.0, car(20.0, 1.0, 2)).of(CAR)
+    assert kept is not None
+    assert (kept.object_id, kept.occluded) == (chosen.object_id, True)
+
+
+def test_object_without_a_range_gives_a_direction() -> None:
+    scene, unranged = Scene(CAR), car(9.0, position_ned_m=None, ground_range_m=float("nan"))
+    view = scene.show(1.0, unranged)
+    assert view.of(CAR) is None
+    target = view.in_sight(CAR)
+    assert target is not None
+    assert target.elevation_rad == unranged.elevation_rad
+    assert scene.show(0.1, car(9.0)).of(CAR) is not None
