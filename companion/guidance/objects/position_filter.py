@@ -32,8 +32,9 @@ from companion.vehicle.state import Vector3
 # An object moves if its estimated speed exceeds this and so many sigma. Errors of the range of a vehicle that
 # flies towards a standing object show as some tenths of its own speed.
 MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
-# Or if it was displaced at that speed for so long: a slow detector gives no sure speeds.
-DISPLACED_S = 1.5
+# Or if it was displaced at one of these speeds for so long: a slow detector gives no sure speeds, and a slow
+# object no significant ones.
+DISPLACED = ((1.5, 1.0), (4.0, 0.5))
 # Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
 MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
 # A detection this many sigma from the fused position shows that the object has moved.
@@ -116,14 +117,17 @@ class PositionFilter:
         self._note_whole(target)
 
     def _moves(self, now_ns: int) -> bool:
-        while len(self._was) > 1 and now_ns - self._was[1][0] >= DISPLACED_S * 1e9:
+        longest_s = DISPLACED[-1][0]
+        while len(self._was) > 1 and now_ns - self._was[1][0] >= longest_s * 1e9:
             self._was.popleft()
         self._was.append((now_ns, self.motion.state))
-        since_ns, then = self._was[0]
-        elapsed_s = (now_ns - since_ns) / 1e9
-        displaced_m = math.hypot(*(self.motion.state - then)[:2])
-        if elapsed_s >= DISPLACED_S and displaced_m > MOVING_MPS * elapsed_s:
-            return True
+        for duration_s, speed_mps in DISPLACED:
+            before = [was for was in self._was if now_ns - was[0] >= duration_s * 1e9]
+            if before:
+                since_ns, then = before[-1]
+                displaced_m = math.hypot(*(self.motion.state - then)[:2])
+                if displaced_m > speed_mps * (now_ns - since_ns) / 1e9:
+                    return True
         speed_sigma_mps = math.sqrt(float(np.trace(self.motion.covariance[2:, 2:])))
         return math.hypot(*self.motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
 

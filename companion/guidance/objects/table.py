@@ -66,7 +66,7 @@ class _Occlusion(NamedTuple):
 class _Object:
     """What the table remembers of one object."""
 
-    def __init__(self, object_id: int, target: Target, vehicle: Vector3) -> None:
+    def __init__(self, object_id: int, target: Target, vehicle: Vector3, *, hidden: bool) -> None:
         self.object_id = object_id
         self.class_name = target.class_name
         self.track_ids: tuple[int, ...] = () if target.track_id is None else (target.track_id,)
@@ -75,7 +75,8 @@ class _Object:
         self.confirmed = target.trusted
         self._frames, self._trusted, self._doubted = 1, int(target.trusted), 0
         self.ambiguous = False
-        self.filter = None if target.position_ned_m is None else PositionFilter(target, vehicle)
+        located = target.position_ned_m is not None and not hidden
+        self.filter = PositionFilter(target, vehicle) if located else None
         self.occlusion: _Occlusion | None = None
         self.refused: list[tuple[Target, Vector3]] = []
         self._intervals_s: deque[float] = deque(maxlen=5)
@@ -205,8 +206,8 @@ class ObjectTable:
         for each in ended:
             self._remove(each)
 
-    def _add(self, target: Target, vehicle: Vector3) -> _Object:
-        created = _Object(self._next_id, target, vehicle)
+    def _add(self, target: Target, vehicle: Vector3, *, hidden: bool) -> _Object:
+        created = _Object(self._next_id, target, vehicle, hidden=hidden)
         self._next_id += 1
         self._objects[created.object_id] = created
         if target.track_id is not None:
@@ -278,10 +279,11 @@ class _Frame:
         )
 
     def _partly_hidden(self, known: _Object, target: Target) -> bool:
-        """Whether a detection shows a part of this object, and all of it was seen lately."""
-        if id(target) not in self._hidden or known.filter is None:
+        """Whether a detection shows a part of this object, which was seen whole or first of all lately."""
+        if id(target) not in self._hidden:
             return False
-        return self._now_ns - known.filter.located_ns <= HIDDEN_S * 1e9
+        since_ns = known.first_ns if known.filter is None else known.filter.located_ns
+        return self._now_ns - since_ns <= HIDDEN_S * 1e9
 
     def _owner(self, target: Target) -> _Object | None:
         return None if target.track_id is None else self._table._owners.get(target.track_id)
@@ -436,7 +438,7 @@ class _Frame:
         if not self._is_second_box(target):
             if known is not None and target.track_id is not None:
                 known.track_ids = tuple(each for each in known.track_ids if each != target.track_id)
-            created = self._table._add(target, self._vehicle)
+            created = self._table._add(target, self._vehicle, hidden=id(target) in self._hidden)
             self._seen[created.object_id] = target
 
     def _manoeuvre(self, known: _Object, target: Target) -> None:
