@@ -35,6 +35,8 @@ AS_GOOD, AS_GOOD_AGAIN = 0.3, 0.1
 SURE_GATE = 4.6
 # Unseen for this long, and at least so many frames, the image tracker's id may have switched.
 IDENTITY_S, IDENTITY_FRAMES = 0.5, 4
+# An id has gone to an object that was unseen for no longer than this, and is expected within REACH_M.
+SWITCHED_S = 3.0
 # Occlusion: unseen for longer than this, then off the expected position or with another id. The association
 # stays a hypothesis for DOUBT_S.
 OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
@@ -408,7 +410,11 @@ class _Frame:
             return True
         if owner.filter is None or owner.filter.begins_again(target):
             return False
-        return target.position_ned_m is not None and self._fit(owner, target)[1].squared > GATE
+        # Where this object is expected is known well for a while only.
+        if target.position_ned_m is None or known.unseen_s(self._now_ns) > SWITCHED_S:
+            return False
+        off_m = self._fit(known, target)[1].off_m
+        return off_m <= REACH_M and self._fit(owner, target)[1].squared > GATE
 
     def _merge(self, young: _Object, known: _Object) -> None:
         """Two objects are one: the older one goes on."""
