@@ -35,7 +35,8 @@ MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
 # Or if it was displaced at one of these speeds for so long: a slow detector gives no sure speeds, and a slow
 # object no significant ones.
 DISPLACED = ((1.5, 1.0), (4.0, 0.5))
-# And at this share of the vehicle's own speed: as it flies, the errors of a standing object's range change.
+# And by one sigma of its position, and at this share of the vehicle's own speed: as it flies, the errors of a
+# standing object's range change.
 OWN_SHARE = 0.4
 # Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
 MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
@@ -106,20 +107,21 @@ class PositionFilter:
         if (target.cut and not self._cut) or self.is_part(target):
             if target.captured_ns - self.located_ns > STALE_S * 1e9:
                 # Where it was seen whole says nothing any more.
-                self.moving = self._moves(target.captured_ns, vehicle)
+                self.moving = self._moves(target, vehicle)
                 self._begin_fusion()
                 self._fuse(self.motion.state[:2], self.motion.covariance[:2, :2])
             return
         place, covariance = np.array(target.position_ned_m[:2]), _covariance(target, vehicle)
-        self.moving = self._moves(target.captured_ns, vehicle)
+        self.moving = self._moves(target, vehicle)
         if self.moving or self._disagrees(place, covariance):
             self._begin_fusion()
         self._forget((target.captured_ns - self.located_ns) / 1e9)
         self._fuse(place, covariance)
         self._note_whole(target)
 
-    def _moves(self, now_ns: int, vehicle: Vector3) -> bool:
-        longest_s = DISPLACED[-1][0]
+    def _moves(self, target: Target, vehicle: Vector3) -> bool:
+        now_ns, longest_s = target.captured_ns, DISPLACED[-1][0]
+        sigma_m = math.sqrt(float(np.linalg.eigvalsh(_covariance(target, vehicle))[-1]))
         while len(self._was) > 1 and now_ns - self._was[1][0] >= longest_s * 1e9:
             self._was.popleft()
         self._was.append((now_ns, self.motion.state, vehicle))
@@ -129,7 +131,8 @@ class PositionFilter:
                 since_ns, then, vehicle_then = before[-1]
                 displaced_m = math.hypot(*(self.motion.state - then)[:2])
                 flown_m = math.dist(vehicle[:2], vehicle_then[:2])
-                if displaced_m > max(speed_mps * (now_ns - since_ns) / 1e9, OWN_SHARE * flown_m):
+                least_m = max(speed_mps * (now_ns - since_ns) / 1e9, OWN_SHARE * flown_m, sigma_m)
+                if displaced_m > least_m:
                     return True
         speed_sigma_mps = math.sqrt(float(np.trace(self.motion.covariance[2:, 2:])))
         return math.hypot(*self.motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
