@@ -171,6 +171,7 @@ class PerceptionReplay:
                 self._inexact["an operator's selection in the images is not replayed"] = None
         return {
             "targets": self._camera.targets,
+            "objects": self._camera.objects.objects,
             "seen_ns": self._newest_ns,
             "class_names": self._detector.class_names,
         }

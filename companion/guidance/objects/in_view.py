@@ -210,7 +210,7 @@ class ObjectsInView:
             if subject.means(each)
             and _certain(each)
             and each.detection.score >= confidence
-            and each.unseen_s(self.now_ns) <= 2 * CHOOSING_S
+            and each.unseen_s(self.now_ns) <= (CHOOSING_S if each.occluded else 2 * CHOOSING_S)
         ]
 
     def take_notes(self) -> list[str]:

@@ -34,7 +34,7 @@ from companion.vehicle.state import Vector3
 MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
 # Or if it was displaced at one of these speeds for so long: a slow detector gives no sure speeds, and a slow
 # object no significant ones.
-DISPLACED = ((1.5, 1.0), (4.0, 0.5))
+DISPLACED = ((1.5, 1.0), (3.0, 0.4))
 # And by one sigma of its position, and at this share of the vehicle's own speed: as it flies, the errors of a
 # standing object's range change.
 OWN_SHARE = 0.4

@@ -154,7 +154,9 @@ def test_mission_approaches_two_persons_of_one_class(tracker: TrackerSettings | 
     mission = SequenceBehaviour(plan_from(text, "test.toml"), flight.guidance.check_requirements)
     outcome = flight.fly(mission, 60.0, on_tick=lambda: begun.append(flight)).outcome
     assert outcome is not None
-    assert [record.success for record in mission.records] == [False, True]
+    assert [record.success for record in mission.records] == [False, True], [
+        r.reason for r in mission.records
+    ]
     assert not any("camera frozen" in event.message for event in flight.events)
 
 
