@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,17 @@ KML = "http://www.opengis.net/kml/2.2"
 # Of two dimensions, 95 % are within this many sigma: sqrt(-2 ln 0.05).
 SIGMAS_95 = 2.4477
 _CORNERS = 36
+_Track = tuple[str, str, int]  # service, camera, id
 Degrees = tuple[float, float]  # longitude, latitude: the order of both formats
 
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """One confirmed track.
+    """One object with a confirmed track.
 
     Attributes:
+        object_id: in the run; None: the camera is not the steering one, so this is a track.
+        track_ids: the image tracker's, the newest last.
         camera: its topic's prefix; empty for the first camera.
         first_ns, last_ns: its first and newest detection, Unix time.
         seen: frames with a detection.
@@ -37,7 +40,8 @@ class Sighting:
         moving: the position is the newest one.
     """
 
-    track_id: int
+    object_id: int | None
+    track_ids: tuple[int, ...]
     camera: str
     class_name: str
     score: float
@@ -70,7 +74,8 @@ class Sighting:
         ellipse = self.ellipse or (None, None, None)
         orientation_rad = ellipse[2]
         return {
-            "track_id": self.track_id,
+            "object_id": self.object_id,
+            "track_ids": list(self.track_ids),
             "camera": self.camera or None,
             "class_name": self.class_name,
             "track_score": self.score,
@@ -86,12 +91,13 @@ class Sighting:
 
 
 def sightings(paths: Sequence[Path]) -> list[Sighting]:
-    """Read every confirmed track of the files of one or several runs, in order of its first detection.
+    """Read every object of the files of one or several runs, in order of its first detection.
 
     Raises:
         RecordingError: a file cannot be read, or has a message that is not what its topic says.
     """
-    found: dict[tuple[str, str, int], Sighting] = {}
+    tracks: dict[_Track, Sighting] = {}
+    owners: dict[_Track, int] = {}
     service = ""
     for path in paths:
         for channel, log_time_ns, data in RecordingReader(path).messages():
@@ -106,13 +112,37 @@ def sightings(paths: Sequence[Path]) -> list[Sighting]:
                 offset_ns = log_time_ns - int(message["published_ns"])
                 for event in message["events"]:
                     key = (service, camera, event["track_id"])
-                    found[key] = _sighting(event, camera, offset_ns, found.get(key))
+                    tracks[key] = _sighting(event, camera, offset_ns, tracks.get(key))
+                for each in message.get("objects", ()):
+                    owners |= {(service, camera, track_id): each["object_id"] for track_id in each["track_ids"]}
             except (ValueError, KeyError, TypeError) as error:
                 raise RecordingError(
                     f"{path}: a message on {channel.topic!r} is not one of the service: "
                     f"{type(error).__name__}: {error}"
                 ) from error
-    return sorted(found.values(), key=lambda sighting: (sighting.first_ns, sighting.track_id))
+    objects: dict[tuple[str, str, int | None, int | None], Sighting] = {}
+    for key, track in sorted(tracks.items(), key=lambda item: item[1].last_ns):
+        object_id = owners.get(key)
+        same = (*key[:2], object_id, key[2] if object_id is None else None)
+        objects[same] = _joined(objects.get(same), replace(track, object_id=object_id))
+    return sorted(objects.values(), key=lambda sighting: (sighting.first_ns, sighting.track_ids))
+
+
+def _joined(before: Sighting | None, after: Sighting) -> Sighting:
+    """The two tracks of one object: the newer one, and its position if it has one."""
+    if before is None:
+        return after
+    located = after if after.position is not None else before
+    return replace(
+        after,
+        track_ids=before.track_ids + after.track_ids,
+        first_ns=min(before.first_ns, after.first_ns),
+        seen=before.seen + after.seen,
+        position=located.position,
+        altitude_amsl_m=located.altitude_amsl_m,
+        ellipse=located.ellipse,
+        moving=located.moving,
+    )
 
 
 def _sighting(event: dict[str, Any], camera: str, offset_ns: int, before: Sighting | None) -> Sighting:
@@ -142,7 +172,8 @@ def _sighting(event: dict[str, Any], camera: str, offset_ns: int, before: Sighti
         position, axes = before.position, before.ellipse
         altitude_amsl_m, moving = before.altitude_amsl_m, before.moving
     return Sighting(
-        int(event["track_id"]),
+        None,
+        (int(event["track_id"]),),
         camera,
         str(event["class_name"]),
         float(event["track_score"]),
@@ -169,7 +200,11 @@ def _features(sighting: Sighting) -> Iterator[dict[str, Any]]:
     yield {"type": "Feature", "geometry": point, "properties": sighting.properties()}
     if ring := sighting.ellipse_95():
         polygon = {"type": "Polygon", "coordinates": [[list(corner) for corner in ring]]}
-        properties = {"track_id": sighting.track_id, "error_ellipse": 0.95}
+        properties = {
+            "object_id": sighting.object_id,
+            "track_ids": list(sighting.track_ids),
+            "error_ellipse": 0.95,
+        }
         yield {"type": "Feature", "geometry": polygon, "properties": properties}
 
 
@@ -180,7 +215,7 @@ def kml(found: Sequence[Sighting]) -> str:
     document = _child(root, "Document")
     for sighting in found:
         placemark = _child(document, "Placemark")
-        _child(placemark, "name", f"{sighting.class_name} {sighting.track_id}")
+        _child(placemark, "name", f"{sighting.class_name} {sighting.track_ids[-1]}")
         span = _child(placemark, "TimeSpan")
         _child(span, "begin", _time(sighting.first_ns))
         _child(span, "end", _time(sighting.last_ns))
@@ -189,7 +224,8 @@ def kml(found: Sequence[Sighting]) -> str:
             if value is not None:
                 data = _child(extended, "Data")
                 data.set("name", key)
-                _child(data, "value", str(value))
+                text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+                _child(data, "value", text)
         if sighting.position is None:
             continue
         geometry = _child(placemark, "MultiGeometry")

@@ -147,7 +147,8 @@ class PerceptionCamera:
         """What was received is outdated, and so is a result of an image from before, when it arrives."""
         self._valid_from_ns = now_ns
         self.newest = self.planned = self.seen_ns = self.obstacles = None
-        self.targets, self.objects = (), ObjectTable()
+        self.targets = ()
+        self.objects.clear()
 
     def localize(self, result: PerceptionResult, history: StateHistory) -> None:
         """Set `targets` from a result, or `localization_error`."""

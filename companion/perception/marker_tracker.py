@@ -231,7 +231,8 @@ class MarkerTracker:
     def discard_received(self) -> None:
         """What was received is outdated."""
         self._seen.clear()
-        self._objects = {camera.name: ObjectTable() for camera in self._detecting}
+        for table in self._objects.values():
+            table.clear()
         self._runs.clear()
 
     def objects(self, camera: PerceptionCamera) -> tuple[TrackedObject, ...]:

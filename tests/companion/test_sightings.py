@@ -1,4 +1,4 @@
-"""`companion sightings`: the tracks of a recording as GeoJSON and KML."""
+"""`companion sightings`: the objects of a recording as GeoJSON and KML."""
 
 from __future__ import annotations
 
@@ -85,6 +85,47 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return writer.path
 
 
+@pytest.fixture(scope="module")
+def changing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording in which object 5 has track 1, then 7, and track 8, which becomes its own, is object 6 first."""
+    writer, converter = new_writer(tmp_path_factory.mktemp("changing")), Converter("vehicle1")
+    run = run_record(plain_settings(), GuidanceOptions(), "service1") | {"unix_offset_ns": BEGAN_NS}
+    messages: list[tuple[str, dict[str, Any]]] = [("@record/run", run)]
+    for track, first_s, last_s, at, objects in (
+        (1, 1, 3, (47.0, 8.0), {5: [1]}),
+        (7, 4, 6, CAR, {5: [1, 7]}),
+        (8, 7, 8, (47.1, 8.1), {6: [8]}),
+        (8, 7, 9, None, {5: [1, 7, 8]}),
+    ):
+        message = {
+            "published_ns": last_s * SECOND_NS,
+            "events": [event(track, first_s, last_s, at)],
+            "objects": [{"object_id": key, "track_ids": value} for key, value in objects.items()],
+        }
+        messages.append(("tracks", message))
+    for topic, message in messages:
+        for converted in converter.convert(topic, dumps(message)):
+            writer.write(*converted)
+    writer.close()
+    return writer.path
+
+
+def test_object_is_one_sighting_however_often_its_track_changes(changing: Path, tmp_path: Path) -> None:
+    done = companion_here("sightings", changing, "--geojson", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    car, ellipse = json.loads(done.stdout)["features"]
+    assert car["properties"]["object_id"] == ellipse["properties"]["object_id"] == 5
+    assert car["properties"]["track_ids"] == [1, 7, 8]
+    assert car["properties"]["first_seen"] == "2026-09-21T14:13:21.000Z"
+    assert car["properties"]["last_seen"] == "2026-09-21T14:13:29.000Z"
+    assert car["properties"]["seen"] == 20 + 20 + 20
+    done = companion_here("sightings", changing, "--kml", cwd=tmp_path)
+    (placemark,) = ElementTree.fromstring(done.stdout).iter(f"{KML}Placemark")
+    assert placemark.findtext(f"{KML}name") == "car 8"
+    data = {each.get("name"): each.findtext(f"{KML}value") for each in placemark.iter(f"{KML}Data")}
+    assert (data["object_id"], data["track_ids"]) == ("5", "1, 7, 8")
+
+
 def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
     done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -101,7 +142,8 @@ def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
     assert car["geometry"]["type"] == "Point"
     assert car["geometry"]["coordinates"] == pytest.approx([CAR[1], CAR[0]], abs=1e-6)
     assert car["properties"] | {"track_score": 0} == {
-        "track_id": 1,
+        "object_id": None,
+        "track_ids": [1],
         "camera": None,
         "class_name": "car",
         "track_score": 0,
@@ -121,7 +163,7 @@ def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
 def test_ellipse_is_a_closed_counterclockwise_ring(path: Path, tmp_path: Path) -> None:
     done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
     (first, *_) = [f for f in json.loads(done.stdout)["features"] if f["properties"].get("error_ellipse")]
-    assert first["properties"] == {"track_id": 1, "error_ellipse": 0.95}
+    assert first["properties"] == {"object_id": None, "track_ids": [1], "error_ellipse": 0.95}
     (ring,) = first["geometry"]["coordinates"]
     assert ring[0] == ring[-1]
     offsets = [north_east(CAR, (latitude, longitude)) for longitude, latitude in ring]

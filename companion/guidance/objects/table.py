@@ -191,6 +191,10 @@ class ObjectTable:
             self.objects = tuple(each.value(captured_ns) for each in self._objects.values())
         return self.objects
 
+    def clear(self) -> None:
+        """Forget every object. The next one gets a number that none has had."""
+        self._objects, self._owners, self.objects = {}, {}, ()
+
     def of_track(self, track_id: int) -> TrackedObject | None:
         """The object that has, or had, an id of the image tracker."""
         owner = self._owners.get(track_id)

@@ -250,6 +250,15 @@ def test_objects_of_a_flickering_detector_are_bounded() -> None:
     assert len(table.objects) <= MOST_OBJECTS
 
 
+def test_no_object_gets_the_number_of_a_forgotten_one() -> None:
+    table = ObjectTable()
+    before = table.update([car((20.0, 0.0), 0, 3)], VEHICLE, T0)
+    table.clear()
+    assert table.objects == ()
+    after = table.update([car((20.0, 0.0), 1, 3)], VEHICLE, T0 + PERIOD_NS)
+    assert [each.object_id for each in after] == [before[0].object_id + 1]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_approach_arrives_among_wrong_boxes(seed: int) -> None:
     """Without a size, turned over, outside of the image, of no numbers, twice, of other classes."""
