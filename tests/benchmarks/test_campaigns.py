@@ -1,4 +1,4 @@
-"""Campaigns over many seeds, as `docs/flight.md` reports them: `make test-slow`."""
+"""Campaigns over many seeds, as `docs/measurements.md` reports them: `make test-slow`."""
 
 from __future__ import annotations
 

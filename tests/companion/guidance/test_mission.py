@@ -21,7 +21,7 @@ from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
 from tests.companion.command_line import companion_here
 
 NAMES = ("person", "car", "traffic light")
-DOCUMENT = Path(__file__).parents[3] / "docs" / "flight.md"
+DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "missions.md"
 
 
 def problems(text: str, names: tuple[str, ...] | None = NAMES) -> list[str]:
@@ -49,7 +49,7 @@ def test_missions_in_the_documents_are_valid() -> None:
     missions = [block for block in blocks if "[[step]]" in block]
     assert missions
     for text in missions:
-        assert plan_from(text, "docs/flight.md", NAMES).steps
+        assert plan_from(text, "missions.md", NAMES).steps
 
 
 @pytest.mark.parametrize(
