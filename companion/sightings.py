@@ -114,7 +114,9 @@ def sightings(paths: Sequence[Path]) -> list[Sighting]:
                     key = (service, camera, event["track_id"])
                     tracks[key] = _sighting(event, camera, offset_ns, tracks.get(key))
                 for each in message.get("objects", ()):
-                    owners |= {(service, camera, track_id): each["object_id"] for track_id in each["track_ids"]}
+                    owners |= {
+                        (service, camera, track_id): each["object_id"] for track_id in each["track_ids"]
+                    }
             except (ValueError, KeyError, TypeError) as error:
                 raise RecordingError(
                     f"{path}: a message on {channel.topic!r} is not one of the service: "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -47,6 +47,7 @@ def flight_with(
     *,
     seed: int = 1,
     rate_hz: float = 10.0,
+    gimbal: bool = False,
 ) -> LockstepFlight:
     printed = Print("APRILTAG_36h11", 7, 0.8, standing=True)
     world = World(
@@ -54,9 +55,10 @@ def flight_with(
         (WorldObject(0, "plate", (0.0, 0.0, 0.0), printed=printed),),
         Ground(("concrete",), seed, 256, 0.1),
     )
+    mount = replace(MOUNT, pitch_rad=0.0, on_gimbal=True) if gimbal else MOUNT
     scene = Scene(world, {0: Motion(at)}, CameraSettings(model=CAMERA, mount=MOUNT, seed=seed), "marker")
-    settings: Settings = camera_settings(CAMERA, MOUNT, SETTINGS)
-    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=1.5)
+    settings: Settings = camera_settings(CAMERA, mount, SETTINGS)
+    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=1.5, gimbal=gimbal)
     camera = RenderedCamera(settings, scene, vehicle, rate_hz=rate_hz, by_flight=True, depth=False)
     flight = LockstepFlight.of_vehicle(vehicle, camera=camera)
     flight.turn_to(0.0)
@@ -113,6 +115,39 @@ def test_orbit_circles_about_the_marker() -> None:
     assert log.outcome is not None
     assert log.outcome.success, log.outcome
     assert np.percentile(np.abs(np.array(radii) - 6.0), 90) < 0.6
+
+
+def test_policy_flies_to_the_marker() -> None:
+    flight = flight_with(lambda _: (10.0, 1.0), rate_hz=5.0)
+    log = flight.fly("policy approach marker=7 distance=5", 60.0)
+    assert log.outcome is not None
+    assert log.outcome.success, log.outcome
+    north, east, _ = flight.vehicle.truth.position_ned_m
+    assert math.hypot(10.0 - north, 1.0 - east) == pytest.approx(5.0, abs=0.7)
+    assert not log.violations
+
+
+def test_gimbal_is_kept_on_the_marker() -> None:
+    flight = flight_with(lambda _: (10.0, 3.0), rate_hz=5.0, gimbal=True)
+    flight.run(1.0)
+    outcome = flight.fly("gimbal marker=7", 12.0).outcome
+    assert outcome is not None
+    assert outcome.success, outcome
+    off_deg: list[float] = []
+
+    def note() -> None:
+        north, east, down = np.subtract((10.0, 3.0, -2.2), flight.vehicle.truth.position_ned_m)
+        gimbal = flight.vehicle.vehicle.gimbal
+        assert gimbal is not None
+        w, x, y, z = gimbal.quaternion
+        axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
+        cosine = np.dot(axis, (north, east, down)) / math.hypot(north, east, down)
+        off_deg.append(math.degrees(math.acos(min(1.0, float(cosine)))))
+
+    outcome = flight.fly("goto forward=0 right=5", 30.0, on_tick=note).outcome
+    assert outcome is not None
+    assert outcome.success, outcome
+    assert np.percentile(off_deg, 95) < 4.0
 
 
 def test_marker_that_disappears_ends_the_command() -> None:
