@@ -87,7 +87,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def changing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording in which object 5 has track 1, then 7, and track 8, which becomes its own, is object 6 first."""
+    """A recording in which object 5 has track 1, then 7, then 8, which was that of object 6."""
     writer, converter = new_writer(tmp_path_factory.mktemp("changing")), Converter("vehicle1")
     run = run_record(plain_settings(), GuidanceOptions(), "service1") | {"unix_offset_ns": BEGAN_NS}
     messages: list[tuple[str, dict[str, Any]]] = [("@record/run", run)]
