@@ -23,7 +23,10 @@ from companion.guidance.objects.estimate import (
     RANDOM_WALK_M2_PER_S,
     Estimate,
     Fit,
+    inverse,
+    largest_sigma,
     measurement_noise,
+    root,
     squared_distance,
 )
 from companion.guidance.objects.target import RangeSource, Target
@@ -121,7 +124,7 @@ class PositionFilter:
 
     def _moves(self, target: Target, vehicle: Vector3) -> bool:
         now_ns, longest_s = target.captured_ns, DISPLACED[-1][0]
-        sigma_m = math.sqrt(float(np.linalg.eigvalsh(_covariance(target, vehicle))[-1]))
+        sigma_m = largest_sigma(_covariance(target, vehicle))
         while len(self._was) > 1 and now_ns - self._was[1][0] >= longest_s * 1e9:
             self._was.popleft()
         self._was.append((now_ns, self.motion.state, vehicle))
@@ -145,7 +148,7 @@ class PositionFilter:
         """
         ways = [self.motion.at(now_ns)]
         if unseen and not self.moving:
-            place, fused = self._fused()
+            place, fused = self._fused
             elapsed_s = (now_ns - self.motion.captured_ns) / 1e9
             covariance = np.diag([0.0] * 2 + [FIRST_VELOCITY_SIGMA_MPS**2] * 2)
             covariance[:2, :2] = fused + np.eye(2) * RANDOM_WALK_M2_PER_S * elapsed_s
@@ -153,6 +156,17 @@ class PositionFilter:
             stood = Estimate(state, covariance, now_ns, self.motion.source, True)
             ways = [stood] if elapsed_s > STOOD_S else [*ways, stood]
         return ways
+
+    def places(self, now_ns: int, *, unseen: bool) -> list[tuple[float, ...]]:
+        """North and east of `at`, which costs much more."""
+        elapsed_s = max(0.0, (now_ns - self.motion.captured_ns) / 1e9)
+        north, east, north_mps, east_mps = self.motion.state.tolist()
+        stood: list[tuple[float, ...]] = []
+        if unseen and not self.moving:
+            stood = [tuple(self._fused[0].tolist())]
+            if elapsed_s > STOOD_S:
+                return stood
+        return [(north + elapsed_s * north_mps, east + elapsed_s * east_mps), *stood]
 
     def begins_again(self, target: Target) -> bool:
         """Whether this is the first detection that the image's edge does not cut off."""
@@ -165,7 +179,7 @@ class PositionFilter:
     def state(self) -> tuple[Vector3, NDArray[np.float64]]:
         """Position in local NED, and (4, 4) covariance of north, east and their velocities."""
         # The filter's own covariance is from frame to frame: what all frames share is in the detections'.
-        place, fused = self._fused()
+        place, fused = self._fused
         if self.moving:
             place = self.motion.state[:2]
         else:
@@ -174,18 +188,13 @@ class PositionFilter:
             fused = fused + np.outer(behind, behind)
         # Scaled to it, so that position and velocity stay correlated as the filter has them.
         scale = np.eye(4)
-        scale[:2, :2] = _root(fused) @ np.linalg.inv(_root(self.motion.covariance[:2, :2]))
+        scale[:2, :2] = root(fused) @ inverse(root(self.motion.covariance[:2, :2]))
         covariance = scale @ self.motion.covariance @ scale.T
         covariance[:2, :2] += np.eye(2) * self._vehicle_sigma_m**2
         return (float(place[0]), float(place[1]), self._down_m), covariance
 
-    def _fused(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Position and covariance of the mean information."""
-        covariance = np.asarray(np.linalg.inv(self._information / self._count), np.float64)
-        return covariance @ (self._weighted / self._count), covariance
-
     def _disagrees(self, measured: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
-        place, fused = self._fused()
+        place, fused = self._fused
         away = measured - place
         spread = fused + covariance + np.eye(2) * JITTER_M**2
         return squared_distance(away, spread) > RESTART_SIGMA**2
@@ -200,10 +209,13 @@ class PositionFilter:
         self._count *= kept
 
     def _fuse(self, measured: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
-        information = np.linalg.inv(covariance)
+        information = inverse(covariance)
         self._information = self._information + information
         self._weighted = self._weighted + information @ measured
         self._count += 1
+        # Forgetting changes neither of the two: it weighs all alike.
+        covariance = inverse(self._information / self._count)
+        self._fused = covariance @ (self._weighted / self._count), covariance
 
     def _note_whole(self, target: Target) -> None:
         assert target.position_ned_m is not None
@@ -220,13 +232,6 @@ def _covariance(target: Target, vehicle: Vector3) -> NDArray[np.float64]:
         return stated
     assert target.position_ned_m is not None
     return measurement_noise(target, np.array(target.position_ned_m[:2]) - vehicle[:2])
-
-
-def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The symmetric square root."""
-    values, vectors = np.linalg.eigh(covariance)
-    root: NDArray[np.float64] = (vectors * np.sqrt(np.maximum(values, 1e-12))) @ vectors.T
-    return root
 
 
 def _height(target: Target) -> float:

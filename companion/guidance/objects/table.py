@@ -279,10 +279,9 @@ class _Frame:
         place = target.position_ned_m
         if place is None or self._partly_hidden(known, target):
             return False
-        return all(
-            math.hypot(place[0] - way.state[0], place[1] - way.state[1]) > reach_m
-            for way in self._ways_of(known)
-        )
+        assert known.filter is not None
+        ways = known.filter.places(self._now_ns, unseen=known.was_occluded(self._now_ns))
+        return all(math.dist(place[:2], way) > reach_m for way in ways)
 
     def _partly_hidden(self, known: _Object, target: Target) -> bool:
         """Whether a detection shows a part of this object, which was seen whole or first of all lately."""
@@ -382,7 +381,7 @@ class _Frame:
             if target.class_name != known.class_name:
                 continue
             own = target.track_id is not None and target.track_id == known.track_id
-            if not own and (self._out_of_reach(known, target, reach_m) or not self._may_be(known, target)):
+            if not own and not self._may_be(known, target, reach_m):
                 continue
             _, fit = self._fit(known, target)
             near = fit.off_m <= reach_m
@@ -397,18 +396,21 @@ class _Frame:
                 fits.append(fit)
         return sorted(fits, key=lambda fit: fit.squared)
 
-    def _may_be(self, known: _Object, target: Target) -> bool:
-        """Whether a detection may be this object.
+    def _may_be(self, known: _Object, target: Target, reach_m: float) -> bool:
+        """Whether a detection may be this object, within a reach of where it is expected.
 
         Its id is newer than the object's last detection; or its owner is expected elsewhere, so that the id
         has gone to another object.
         """
-        if target.track_id is None and not known.track_ids:
-            return True  # without a tracker the place is all there is
-        if not known.confirmed or not target.trusted:
+        # Without a tracker the place is all there is.
+        untracked = target.track_id is None and not known.track_ids
+        sure = known.confirmed and target.trusted
+        if not untracked and (not sure or (target.position_ned_m is None and target.track_id is not None)):
             return False
-        if target.position_ned_m is None and target.track_id is not None:
+        if self._out_of_reach(known, target, reach_m):
             return False
+        if untracked:
+            return True
         owner = self._owner(target)
         if owner is None or owner.first_ns > known.last_ns or owner.track_id != target.track_id:
             return True

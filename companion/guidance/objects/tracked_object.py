@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.guidance.objects.estimate import acceleration_noise
+from companion.guidance.objects.estimate import acceleration_noise, largest_sigma
 from companion.guidance.objects.position_filter import STALE_S
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Vector3
@@ -77,7 +76,7 @@ class TrackedObject:
     @property
     def speed_sigma_mps(self) -> float:
         """One sigma of the velocity along the longer axis of its ellipse."""
-        return math.sqrt(max(0.0, float(np.linalg.eigvalsh(np.array(self.covariance)[2:, 2:])[-1])))
+        return largest_sigma(np.array(self.covariance)[2:, 2:])
 
     @property
     def certain(self) -> bool:
