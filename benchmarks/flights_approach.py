@@ -20,7 +20,7 @@ from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
 

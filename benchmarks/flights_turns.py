@@ -19,7 +19,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviours.follow import FollowBehaviour
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 
 DISTANCE_M, HEIGHT_M = 10.0, 4.0

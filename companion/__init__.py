@@ -32,9 +32,8 @@ if TYPE_CHECKING:
         Number,
         behaviour,
     )
-    from companion.guidance.objects.subject import Subject
     from companion.guidance.objects.table import ObjectTable
-    from companion.guidance.objects.tracked_object import TrackedObject
+    from companion.guidance.objects.tracked_object import Subject, TrackedObject
     from companion.service import Service
     from companion.settings import Settings
     from companion.vehicle.setpoint import Setpoint
@@ -55,9 +54,8 @@ _MODULES = {
         "Number",
         "behaviour",
     ),
-    "companion.guidance.objects.subject": ("Subject",),
     "companion.guidance.objects.table": ("ObjectTable",),
-    "companion.guidance.objects.tracked_object": ("TrackedObject",),
+    "companion.guidance.objects.tracked_object": ("Subject", "TrackedObject"),
     "companion.client": ("connect",),
     "companion.service": ("Service",),
     "companion.settings": ("Settings",),

@@ -12,8 +12,8 @@ from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.in_view import ObjectsInView
 from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import Target
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget

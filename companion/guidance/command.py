@@ -28,7 +28,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar, dataclass_transform, get_
 
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.objects.subject import GimbalGoal, Subject
+from companion.guidance.objects.tracked_object import GimbalGoal, Subject
 from companion.guidance.search_pattern import Footprint
 from vision.class_names import class_named, near_names
 from vision.registry import RegistrationError

@@ -34,8 +34,7 @@ from companion.guidance.limits.obstacles import NO_RULES, ObstacleRules
 from companion.guidance.mode_control import ModeControl, Phase
 from companion.guidance.objects.closing_check import ClosingCheck
 from companion.guidance.objects.in_view import Choice, ObjectsInView
-from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.landing_target import LandingTarget
@@ -192,7 +191,8 @@ class Guidance:
             now_ns: CLOCK_MONOTONIC nanoseconds; never decreasing.
         """
         out = self._out
-        out.begin(now_ns)
+        out.now_ns = now_ns
+        out.requests, out.cancelled, out.events, out.results, out.endings = [], [], [], [], []
         self._setpoints.use_autopilot(inputs.parameters)
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)

@@ -11,9 +11,8 @@ from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
-from companion.guidance.objects.subject import GimbalGoal
 from companion.guidance.objects.target import Target
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import GimbalGoal, TrackedObject
 from companion.guidance.search_pattern import Footprint
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
@@ -280,11 +279,6 @@ class OutputCollector:
     results: list[CommandResult] = field(default_factory=list)
     endings: list[CommandResult] = field(default_factory=list)
     _identifier: int = 0
-
-    def begin(self, now_ns: int) -> None:
-        """A new step."""
-        self.now_ns = now_ns
-        self.requests, self.cancelled, self.events, self.results, self.endings = [], [], [], [], []
 
     def request(self, action: Action, commanded_ns: int | None = None) -> int:
         """Add a request; returns its identifier.

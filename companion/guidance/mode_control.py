@@ -112,7 +112,7 @@ class ModeControl:
             flying_by_setpoint=self.phase in (Phase.ENGAGING, Phase.OFFBOARD),
             sent=self._setpoints.sent if active else None,
             landing=landing,
-            altitude_acceptance_m=inputs.parameters.altitude_acceptance_m,
+            altitude_acceptance_m=self._setpoints.altitude_acceptance_m,
         )
 
     def yield_command(self, why: str | None, context: BehaviourContext) -> str | None:

@@ -31,6 +31,7 @@ class SetpointOutput:
         sent: the last setpoint after the envelope, or the brake that is streamed while a mode is requested.
         limited_by: names of the limits that changed `sent`.
         path: (north, east) points of the active path around obstacles; empty: none.
+        altitude_acceptance_m: of the autopilot, how far below its goal it ends a climb; None: not known.
     """
 
     def __init__(
@@ -46,6 +47,7 @@ class SetpointOutput:
         self._out = out
         self._limits = limits
         self._read = NOTHING_READ
+        self.altitude_acceptance_m: float | None = None
         self._envelope = Envelope(limits)
         self._memory = ObstacleMemory()
         self._avoidance = Avoidance(obstacles.margin_m)
@@ -62,6 +64,7 @@ class SetpointOutput:
         if read == self._read:
             return
         self._read = read
+        self.altitude_acceptance_m = read.altitude_acceptance_m
         self._envelope.limits, words = within_autopilot(self._limits, read)
         if words:
             self._out.event(EventKind.NOTED, "", words)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import cache
 
 import cv2
 import numpy as np
@@ -163,16 +164,14 @@ def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame]
     """Return a function from a frame to the camera's view; None without an attitude at that time."""
     if not settings.tracker.camera_motion:
         return lambda _: None
-    pose_at = _pose_at(settings, telemetry)
+    pose_at, model = _pose_at(settings, telemetry), cache(settings.camera.model)
 
     def view_at(frame: Frame) -> CameraView | None:
         pose = pose_at(frame.captured_ns)
         if pose is None:
             return None
         mount, ned_from_body = pose
-        return CameraView(
-            settings.camera.model(frame.width, frame.height), mount.ned_from_optical(ned_from_body)
-        )
+        return CameraView(model(frame.width, frame.height), mount.ned_from_optical(ned_from_body))
 
     return view_at
 

@@ -12,6 +12,7 @@ import os
 import statistics
 from collections import deque
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from companion.settings import DetectorSection, Section, Settings
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.state import VehicleState
-from vision.camera_model import CameraCalibration
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.obstacle_sectors import ObstacleSectors
 from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
@@ -53,6 +54,14 @@ def recorded_frames_names(settings: Settings) -> dict[str | None, str]:
         return {}
     first = f"companion-{os.getpid()}-{settings.vehicle.name}-recorded"
     return {None: first} | {name: f"{first}-{name}" for name in settings.cameras}
+
+
+class _Optics(NamedTuple):
+    """Lens and mount of a camera, and the heights of its detector's classes, metres."""
+
+    model: CameraModel
+    mount: CameraMount
+    heights_m: dict[str, float]
 
 
 class PerceptionCamera:
@@ -90,6 +99,7 @@ class PerceptionCamera:
         self.path_request: PathRequest | None = None
         self._class_names = class_names
         self._has_depth = False
+        self._optics: tuple[tuple[object, ...], _Optics] | None = None
         self._ranging: tuple[tuple[object, ...], RangeMeans] | None = None
         self._repeated = ""
         self._valid_from_ns = 0
@@ -136,12 +146,20 @@ class PerceptionCamera:
         newest = self.newest
         if newest is None:
             return ALL_MEANS
-        of = (newest.width, newest.height, pitch_rad, self._has_depth, self.settings)
+        optics = self._optics_of(newest)
+        of = (optics, pitch_rad, self._has_depth)
         if self._ranging is None or self._ranging[0] != of:
-            camera = self.settings.camera.model(newest.width, newest.height)
-            heights = frozenset(self.settings.detector.heights())
-            self._ranging = of, RangeMeans(self._has_depth, sees_ground(camera, pitch_rad), heights)
+            ground, heights = sees_ground(optics.model, pitch_rad), frozenset(optics.heights_m)
+            self._ranging = of, RangeMeans(self._has_depth, ground, heights)
         return self._ranging[1]
+
+    def _optics_of(self, result: PerceptionResult) -> _Optics:
+        """The camera for images of this size; computed again when the camera's calibration is adopted."""
+        of = (result.width, result.height, self.settings)
+        if self._optics is None or self._optics[0] != of:
+            camera, heights_m = self.settings.camera, self.settings.detector.heights()
+            self._optics = of, _Optics(camera.model(result.width, result.height), camera.mount(), heights_m)
+        return self._optics[1]
 
     def discard_received(self, now_ns: int) -> None:
         """What was received is outdated, and so is a result of an image from before, when it arrives."""
@@ -153,13 +171,9 @@ class PerceptionCamera:
     def localize(self, result: PerceptionResult, history: StateHistory) -> None:
         """Set `targets` from a result, or `localization_error`."""
         try:
+            detections, optics = result.detections.records(), self._optics_of(result)
             self.targets = targets_from_detections(
-                result.detections.records(),
-                result.captured_ns,
-                self.settings.camera.model(result.width, result.height),
-                self.settings.camera.mount(),
-                history,
-                self.settings.detector.heights(),
+                detections, result.captured_ns, optics.model, optics.mount, history, optics.heights_m
             )
             self.localization_error = ""
             vehicle = history.at(result.captured_ns).position_ned_m

@@ -18,7 +18,7 @@ from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import CommandInput, CommandSource, GuidanceInput, GuidanceOutput
 from companion.guidance.objects.from_detections import HistorySamples
-from companion.guidance.objects.subject import GimbalGoal
+from companion.guidance.objects.tracked_object import GimbalGoal
 from companion.recording.encoding import decode, encode, layout_of
 
 

@@ -20,6 +20,7 @@ before EXTENDED_SYS_STATE.
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import lru_cache
 
 PX4, ARDUPILOT = 12, 3  # MAV_AUTOPILOT
 # The one that the autopilot answers for shows which program it runs (Rover has FRAME_CLASS too, and a type
@@ -105,6 +106,7 @@ def autopilot_text(autopilot: int) -> str:
     return AUTOPILOT_NAMES.get(autopilot, f"MAV_AUTOPILOT {autopilot}")
 
 
+@lru_cache(maxsize=64)  # asked in every step
 def why_not_flown(
     mav_type: int, autopilot: int, vtol_state: VtolState | None, *, is_plane: bool | None = None
 ) -> str | None:

@@ -47,9 +47,8 @@ from companion.guidance.motion import (
     stopping_speed,
 )
 from companion.guidance.objects.closing_check import Approached
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import RangeSource
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.search_pattern import NARROW_FIELD_RAD, field_of_view_rad
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint

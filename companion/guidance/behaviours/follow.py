@@ -21,8 +21,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
 from companion.guidance.motion import add_velocity_error, correction, position_and_yaw
-from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle

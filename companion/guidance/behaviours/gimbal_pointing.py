@@ -21,7 +21,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.gimbal.controller import POINT_TIMEOUT_S, POINTED_RAD, direction_text
 from companion.guidance.gimbal.pointing import Pointing
-from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject
+from companion.guidance.objects.tracked_object import GimbalGoal, GlobalPoint, Subject
 from companion.vehicle.gimbal import GimbalAim
 
 

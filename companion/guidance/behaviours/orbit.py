@@ -29,7 +29,7 @@ from companion.guidance.motion import (
     position_and_yaw,
     stopping_speed,
 )
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle

@@ -25,8 +25,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.motion import home_of, in_degrees
 from companion.guidance.objects.closing_check import Approached
-from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 

@@ -24,8 +24,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.motion import Arrival, position_and_yaw, speed_of
 from companion.guidance.objects.closing_check import Approached
-from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3

@@ -27,7 +27,7 @@ from companion.guidance.interface import (
     ReleaseGimbal,
     TakeGimbal,
 )
-from companion.guidance.objects.subject import GimbalGoal
+from companion.guidance.objects.tracked_object import GimbalGoal
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame, address_text
 from companion.vehicle.state import VehicleState
 from vision.attitude import wrap_angle

@@ -7,8 +7,7 @@ import math
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.motion import home_of, local_from_global
 from companion.guidance.objects.in_view import nearest_ahead
-from companion.guidance.objects.subject import GimbalGoal, GlobalPoint, Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import GimbalGoal, GlobalPoint, Subject, TrackedObject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from companion.vehicle.state import Vector3, VehicleState
 

@@ -13,9 +13,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from companion.guidance.motion import in_degrees
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import RangeSource, Target
-from companion.guidance.objects.tracked_object import MOST_DOUBT, TrackedObject
+from companion.guidance.objects.tracked_object import MOST_DOUBT, Subject, TrackedObject
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 

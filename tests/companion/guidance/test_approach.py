@@ -4,8 +4,8 @@ import random
 import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import RangeSource
+from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

@@ -25,7 +25,7 @@ from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.attitude import wrap_angle

@@ -16,7 +16,7 @@ from companion.guidance.behaviours.patrol import PatrolBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput
 from companion.guidance.limits.obstacles import ObstacleRules
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.recording.encoding import decode, encode
 from companion.settings.reading import ConfigurationError, load_settings
 from tests.companion.guidance.guidance_harness import STEP_S, GuidanceHarness, assert_failed, flying

@@ -19,7 +19,7 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.grammar import json_schema, markdown, parse, usage
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.objects.ranging import RangeMeans
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
 from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, engaged, flying

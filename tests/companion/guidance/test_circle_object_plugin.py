@@ -20,7 +20,7 @@ from companion.bench.synthetic_detector import SceneObject, ScenePose, Synthetic
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.grammar import json_schema, parse, usage
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.plugins import load_plugins
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.guidance.test_circle_plugin import installed_package

@@ -8,7 +8,7 @@ from benchmarks.flights_follow import run
 from companion.guidance.behaviours.follow import FollowBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 

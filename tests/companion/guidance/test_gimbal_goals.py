@@ -19,7 +19,7 @@ from companion.guidance.behaviour import BehaviourContext, Outcome
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.gimbal.pointing import LOST_AFTER_S, Pointing
 from companion.guidance.grammar import parse
-from companion.guidance.objects.subject import GlobalPoint, Subject
+from companion.guidance.objects.tracked_object import GlobalPoint, Subject
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.gimbal_flight import PERSON_M, gimbal_flight, person
 from tests.companion.guidance.guidance_harness import flying

@@ -21,7 +21,7 @@ from companion.guidance import (
 )
 from companion.guidance.command import COMMANDS, NO_CONTEXT, Command, GrammarError, arguments_of
 from companion.guidance.grammar import describe, parse
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
 

@@ -22,7 +22,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import Answer, CommandInput, EventKind, FindGimbal, GuidanceInput, Request
 from companion.guidance.mode_control import Phase
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.gimbal import NOBODY, GimbalState, YawFrame
 from companion.vehicle.state import FlightMode, LandedState
 from tests.companion.guidance.guidance_harness import (

@@ -7,8 +7,8 @@ import pytest
 
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.target import DOUBTED, RangeSource, Target
+from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from tests.companion.guidance.one_object import OneObject

@@ -8,10 +8,9 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.table import DOUBT_S, ObjectTable
 from companion.guidance.objects.target import RangeSource, Target
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from tests.companion.guidance.one_object import OneObject
 
 SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1

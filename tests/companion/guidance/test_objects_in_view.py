@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 
 from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
-from companion.guidance.objects.subject import Subject
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import DOUBTED, Target
+from companion.guidance.objects.tracked_object import Subject
 
 HERE = (0.0, 0.0, -4.0)
 CAR, TRACK = Subject("car"), Subject(track_id=1)

@@ -19,8 +19,7 @@ from companion.bus.session import encode as encode_message
 from companion.bus.topics import DETECTIONS, RUN, TRACKS, Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.objects.in_view import ObjectsInView
-from companion.guidance.objects.subject import Subject
-from companion.guidance.objects.tracked_object import TrackedObject
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.perception.cameras import PerceptionCamera
 from companion.recording.convert import INPUT_CHANNEL, Converter
 from companion.recording.encoding import dumps, encode

@@ -16,7 +16,7 @@ from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.gimbal.pitch import GimbalSweep
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 from tests.companion.guidance.guidance_harness import (

@@ -20,7 +20,7 @@ from companion.guidance.grammar import parse
 from companion.guidance.interface import CommandInput, EventKind, GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.objects.subject import Subject
+from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.state import FlightMode, LandedState
 from companion.vehicle.vehicle_type import VtolState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, engaged, flying, parked
