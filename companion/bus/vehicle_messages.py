@@ -113,7 +113,7 @@ def pose_message(pose: Pose) -> PoseBody:
         "age_s": round(pose.age_s, 4),
         "latitude_deg": round(pose.latitude_deg, 8),
         "longitude_deg": round(pose.longitude_deg, 8),
-        "altitude_amsl_m": round(pose.altitude_m, 3),
+        "altitude_amsl_m": round(pose.altitude_amsl_m, 3),
         "velocity_ned_mps": [round(value, 3) for value in pose.velocity_ned_mps],
         "heading_rad": round(pose.heading_rad, 4),
         "turn_rate_radps": round(pose.turn_rate_radps, 4),

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
-from companion.guidance.formation.pose import Pose, pose_from_message, pose_of
+from companion.guidance.formation.pose import Pose, Role, pose_from_message, pose_of
 from companion.peer_data import parse_object
 from companion.vehicle.state import VehicleState
 
@@ -70,7 +70,7 @@ class PoseSharing:
             active: the active behaviour. in_command: whether guidance is in command of the vehicle.
         """
         note = active.note if isinstance(active, FormationBehaviour) else None
-        role = "follower" if note is not None else "alone"
+        role: Role = "follower" if note is not None else "alone"
         if note is None and self._neighbours.leads():
             role = "leader"
         return pose_of(

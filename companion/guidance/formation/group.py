@@ -25,7 +25,7 @@ class Agreement:
 
     Attributes:
         plan: the active plan. slots: vehicle → slot, from 1. count: number of slots.
-        by: the vehicle that assigned them. members: names of all members, including silent ones.
+        by: the vehicle that assigned them.
         worst_error_m: greatest slot error of the members that are not silent.
     """
 
@@ -33,7 +33,6 @@ class Agreement:
     slots: dict[str, int]
     count: int
     by: str
-    members: tuple[str, ...]
     worst_error_m: float = 0.0
 
     def offset(self, name: str, *, centre_taken: bool) -> Vector3 | None:
@@ -93,8 +92,7 @@ class Group:
         elif notes[by].plan == plan and notes[by].count:
             self._slots, self._count, self._basis = dict(notes[by].slots), notes[by].count, None
         worst = max([own_error_m, *(notes[name].error_m for name in active)])
-        members = tuple(sorted([self.own, *notes]))
-        return Agreement(plan, dict(self._slots), self._count, by, members, worst)
+        return Agreement(plan, dict(self._slots), self._count, by, worst)
 
     def _agreed_plan(self, plans: Sequence[Plan]) -> Plan:
         newest = max(plans, default=None)

@@ -228,7 +228,7 @@ def _age_s(received: _Received, now_ns: int) -> float:
 
 def _predicted(name: str, received: _Received, anchor: Anchor, age_s: float) -> Neighbour:
     pose, ahead_s = received.pose, min(age_s, SILENT_S)
-    position = anchor.local(pose.latitude_deg, pose.longitude_deg, pose.altitude_m)
+    position = anchor.local(pose.latitude_deg, pose.longitude_deg, pose.altitude_amsl_m)
     north, east, down = (p + v * ahead_s for p, v in zip(position, pose.velocity_ned_mps, strict=True))
     silent = age_s > SILENT_S
     return Neighbour(

@@ -7,17 +7,44 @@ Stamps are of the sender's clock, whose offset is unknown to receivers; see `nei
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from companion.geometry.formation import SHAPES
 from companion.peer_data import PeerDataError
-from companion.vehicle.state import LandedState, Vector3, VehicleState
+from companion.vehicle.state import LandedState, VehicleState
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
 GLOBAL_MAX_AGE_S = 0.5
-ROLES = ("alone", "leader", "follower", "virtual")
+
+
+def _within(low: float, high: float) -> Any:
+    """The range of a number in a message."""
+    return Field(strict=True, ge=low, le=high, allow_inf_nan=False)
+
+
+def _from(low: int) -> Any:
+    """The least value of an integer in a message; the greatest is that of a 64-bit nanosecond stamp."""
+    return Field(strict=True, ge=low, lt=2**63)
+
+
+Role = Literal["alone", "leader", "follower", "virtual"]
+_Name = Annotated[str, Field(strict=True, min_length=1, max_length=100)]
+_Angle = Annotated[float, _within(-10.0, 10.0)]
+_TurnRate = Annotated[float, _within(-50.0, 50.0)]
+_Speed = Annotated[float, _within(-200.0, 200.0)]
+_Latitude = Annotated[float, _within(-90.0, 90.0)]
+_Longitude = Annotated[float, _within(-180.0, 180.0)]
+_Altitude = Annotated[float, _within(-1000.0, 100_000.0)]
+_Place = tuple[_Latitude, _Longitude, _Altitude]
+_Velocity = tuple[_Speed, _Speed, _Speed]
+_Flag = Annotated[bool, Field(strict=True)]
+_Slots = Annotated[
+    tuple[tuple[_Name, Annotated[int, _from(1)]], ...],
+    BeforeValidator(lambda slots: tuple(slots.items()) if isinstance(slots, dict) else slots),
+]
 
 
 class PoseError(PeerDataError):
@@ -28,10 +55,10 @@ class PoseError(PeerDataError):
 class Plan:
     """A formation plan. Of two plans the greater one holds; every new command increments `version`."""
 
-    version: int
-    author: str
-    shape: str
-    spacing_m: float
+    version: Annotated[int, _from(0)]
+    author: _Name
+    shape: Annotated[str, Field(pattern=f"^({'|'.join(SHAPES)})$")]
+    spacing_m: Annotated[float, _within(0.1, 1000.0)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +73,12 @@ class Structure:
         over: it is at the end of its path, and all vehicles are in their slots.
     """
 
-    place: Vector3
-    velocity_ned_mps: Vector3
-    heading_rad: float
-    origin: Vector3
-    along_m: float
-    over: bool = False
+    place: _Place
+    velocity_ned_mps: _Velocity
+    heading_rad: _Angle
+    origin: _Place
+    along_m: Annotated[float, _within(0.0, 1e9)]
+    over: _Flag = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,14 +96,14 @@ class FormationNote:
         structure: state of the virtual structure, if any.
     """
 
-    leader: str
+    leader: _Name
     plan: Plan
-    wish: int | None = None
-    error_m: float = 0.0
-    slots: tuple[tuple[str, int], ...] = ()
-    count: int = 0
-    heading_rad: float = 0.0
-    turn_rate_radps: float = 0.0
+    wish: Annotated[int, _from(1)] | None = None
+    error_m: Annotated[float, _within(0.0, 1e6)] = 0.0
+    slots: _Slots = ()
+    count: Annotated[int, _from(0)] = 0
+    heading_rad: _Angle = 0.0
+    turn_rate_radps: _TurnRate = 0.0
     structure: Structure | None = None
 
 
@@ -87,7 +114,7 @@ class Pose:
     Attributes:
         vehicle: its name. source: changes when its service restarts.
         published_ns: by the sender's CLOCK_MONOTONIC. age_s: of the position, when it was published.
-        altitude_m: above sea level. heading_rad: clockwise from north.
+        altitude_amsl_m: above sea level. heading_rad: clockwise from north.
         turn_rate_radps: of the heading, clockwise.
         role: alone, leader, follower or virtual (not a real vehicle).
         airborne: armed and not on the ground.
@@ -95,21 +122,24 @@ class Pose:
         mode: of its autopilot, a `FlightMode`.
     """
 
-    vehicle: str
-    source: str
-    published_ns: int
-    age_s: float
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-    velocity_ned_mps: Vector3
-    heading_rad: float
-    turn_rate_radps: float
-    role: str = "alone"
-    airborne: bool = True
-    formation: FormationNote | None = None
-    in_command: bool | None = None
-    mode: str = "unknown"
+    vehicle: _Name
+    source: _Name
+    published_ns: Annotated[int, _from(0)]
+    age_s: Annotated[float, _within(0.0, 60.0)]
+    latitude_deg: _Latitude
+    longitude_deg: _Longitude
+    altitude_amsl_m: _Altitude
+    velocity_ned_mps: _Velocity
+    heading_rad: _Angle
+    turn_rate_radps: _TurnRate
+    role: Role
+    airborne: _Flag
+    formation: FormationNote | None
+    in_command: _Flag | None = None
+    mode: _Name = "unknown"
+
+
+_POSE = TypeAdapter(Pose)
 
 
 def global_problem(state: VehicleState, now_ns: int) -> str | None:
@@ -128,7 +158,7 @@ def pose_of(
     *,
     vehicle: str,
     source: str,
-    role: str = "alone",
+    role: Role = "alone",
     formation: FormationNote | None = None,
     in_command: bool | None = None,
 ) -> Pose | None:
@@ -169,117 +199,9 @@ def turn_rate(state: VehicleState) -> float:
 
 def pose_from_message(message: Any) -> Pose:
     """Parse and validate a published pose. Raises PoseError."""
-    fields = _Fields(message, "pose")
-    role = fields.text("role")
-    if role not in ROLES:
-        raise PoseError(f"pose: role must be one of {', '.join(ROLES)}, got {role!r}")
-    formation = fields.value("formation")
-    return Pose(
-        fields.text("vehicle"),
-        fields.text("source"),
-        fields.whole("published_ns", 0),
-        fields.number("age_s", 0.0, 60.0),
-        fields.number("latitude_deg", -90.0, 90.0),
-        fields.number("longitude_deg", -180.0, 180.0),
-        fields.number("altitude_amsl_m", -1000.0, 100_000.0),
-        fields.vector("velocity_ned_mps", 200.0),
-        fields.number("heading_rad", -10.0, 10.0),
-        fields.number("turn_rate_radps", -50.0, 50.0),
-        role,
-        fields.value("airborne") is True,
-        None if formation is None else _note_from(formation),
-        fields.flag("in_command"),
-        fields.text("mode") if "mode" in fields.names else "unknown",
-    )
-
-
-def _note_from(message: Any) -> FormationNote:
-    fields = _Fields(message, "pose.formation")
-    plan = _Fields(fields.value("plan"), "pose.formation.plan")
-    shape = plan.text("shape")
-    if shape not in SHAPES:
-        raise PoseError(f"pose.formation.plan: shape must be one of {', '.join(SHAPES)}, got {shape!r}")
-    slots = _Fields(fields.value("slots"), "pose.formation.slots")
-    wish, structure = fields.value("wish"), fields.value("structure")
-    return FormationNote(
-        fields.text("leader"),
-        Plan(plan.whole("version", 0), plan.text("author"), shape, plan.number("spacing_m", 0.1, 1000.0)),
-        None if wish is None else fields.whole("wish", 1),
-        fields.number("error_m", 0.0, 1e6),
-        tuple((name, slots.whole(name, 1)) for name in slots.names),
-        fields.whole("count", 0),
-        fields.number("heading_rad", -10.0, 10.0),
-        fields.number("turn_rate_radps", -50.0, 50.0),
-        None if structure is None else _structure_from(structure),
-    )
-
-
-def _structure_from(message: Any) -> Structure:
-    fields = _Fields(message, "pose.formation.structure")
-    return Structure(
-        fields.place("place"),
-        fields.vector("velocity_ned_mps", 200.0),
-        fields.number("heading_rad", -10.0, 10.0),
-        fields.place("origin"),
-        fields.number("along_m", 0.0, 1e9),
-        fields.value("over") is True,
-    )
-
-
-class _Fields:
-    """Fields of an object, validated as they are read."""
-
-    def __init__(self, message: Any, what: str) -> None:
-        if not isinstance(message, Mapping):
-            raise PoseError(f"{what} must be an object, got {type(message).__name__}")
-        self._message, self._what = message, what
-
-    @property
-    def names(self) -> list[str]:
-        return list(self._message)
-
-    def value(self, key: str) -> Any:
-        if key not in self._message:
-            raise PoseError(f"{self._what}: {key} is missing")
-        return self._message[key]
-
-    def text(self, key: str) -> str:
-        value = self.value(key)
-        if not isinstance(value, str) or not 1 <= len(value) <= 100:
-            raise PoseError(f"{self._what}: {key} must be a string of 1 to 100 characters, got {value!r:.50}")
-        return value
-
-    def flag(self, key: str) -> bool | None:
-        """None where it is not published."""
-        value = self.value(key) if key in self._message else None
-        if value is not None and not isinstance(value, bool):
-            raise PoseError(f"{self._what}: {key} must be true, false or null, got {value!r:.50}")
-        return value
-
-    def number(self, key: str, low: float, high: float) -> float:
-        return self._checked(key, self.value(key), low, high)
-
-    def whole(self, key: str, low: int) -> int:
-        value = self.value(key)
-        # The range of a 64-bit nanosecond stamp.
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value < 2**63:
-            raise PoseError(f"{self._what}: {key} must be an integer of at least {low}, got {value!r:.50}")
-        return value
-
-    def vector(self, key: str, limit: float) -> Vector3:
-        return self._three(key, ((-limit, limit),) * 3)
-
-    def place(self, key: str) -> Vector3:
-        return self._three(key, ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 100_000.0)))
-
-    def _three(self, key: str, ranges: tuple[tuple[float, float], ...]) -> Vector3:
-        value = self.value(key)
-        if not isinstance(value, list | tuple) or len(value) != 3:
-            raise PoseError(f"{self._what}: {key} must be three numbers, got {value!r:.50}")
-        x, y, z = (self._checked(key, part, *limits) for part, limits in zip(value, ranges, strict=True))
-        return (x, y, z)
-
-    def _checked(self, key: str, value: Any, low: float, high: float) -> float:
-        if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
-            raise PoseError(f"{self._what}: {key} must be {low:g} to {high:g}, got {value!r:.50}")
-        return float(value)
+    try:
+        return _POSE.validate_python(message)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(map(str, ("pose", *first["loc"])))
+        raise PoseError(f"{where}: {first['msg']}, got {first['input']!r:.50}") from None

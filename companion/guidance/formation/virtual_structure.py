@@ -113,9 +113,3 @@ class VirtualStructure:
         """The state to publish; `over`: finished, and all vehicles are in their slots."""
         position, velocity, _ = self.motion()
         return Structure(anchor.globally(position), velocity, heading_rad, self._origin, self.along_m, over)
-
-    @property
-    def status(self) -> str:
-        if self._path is None:
-            return "not started"
-        return f"{self.along_m:.0f} of {self._path.length_m:.0f} m"

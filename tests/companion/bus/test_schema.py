@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
 from companion.bus.bodies.service import CommandReplyBody, EventBody
 from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_markdown, write_schemas
-from companion.guidance.formation.pose import ROLES
+from companion.guidance.formation.pose import Role
 from companion.guidance.objects.target import RangeSource
 from tests.companion.bus.message_check import check_message, closed, validator
 from tests.companion.command_line import companion_here
@@ -37,7 +37,7 @@ def test_words_are_those_of_the_code() -> None:
     assert detection["track_state"]["anyOf"][0]["enum"] == [TRACK_CONFIRMED, TRACK_TENTATIVE, TRACK_NONE]
     assert detection["range_source"]["anyOf"][0]["enum"] == [source.value for source in RangeSource]
     assert event["event"]["enum"] == [kind.value for kind in TrackEventKind]
-    assert validator("pose").schema["properties"]["role"]["enum"] == list(ROLES)
+    assert validator("pose").schema["properties"]["role"]["enum"] == list(get_args(Role))
 
 
 def test_check_refuses_unknown_missing_and_wrong_fields() -> None:

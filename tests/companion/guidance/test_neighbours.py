@@ -33,7 +33,8 @@ def pose(
     source: str = "a",
 ) -> Pose:
     latitude, longitude, altitude = PLACE.globally(offset)
-    return Pose(name, source, published_ns, 0.0, latitude, longitude, altitude, (2.0, 0.0, 0.0), 0.5, 0.1)
+    place, moving = (latitude, longitude, altitude), ((2.0, 0.0, 0.0), 0.5, 0.1)
+    return Pose(name, source, published_ns, 0.0, *place, *moving, "alone", True, None)
 
 
 def state_at(now_ns: int) -> VehicleState:

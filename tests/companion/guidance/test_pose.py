@@ -71,7 +71,7 @@ def test_pose_of_another_program_has_no_command_or_mode() -> None:
 def test_pose_has_position_and_age() -> None:
     pose = pose_of(STATE, NOW_NS, vehicle="beta", source="s")
     assert pose is not None
-    assert (pose.age_s, pose.latitude_deg, pose.altitude_m) == (0.02, 47.4, 493.0)
+    assert (pose.age_s, pose.latitude_deg, pose.altitude_amsl_m) == (0.02, 47.4, 493.0)
     assert pose.heading_rad == pytest.approx(0.7)
     assert pose.turn_rate_radps == pytest.approx(0.3)
     assert pose.airborne
@@ -105,32 +105,32 @@ def test_turn_rate_from_body_rates_and_roll() -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "words"),
+    ("path", "value"),
     [
-        (("latitude_deg",), 91.0, "latitude_deg must be"),
-        (("latitude_deg",), math.nan, "latitude_deg must be"),
-        (("velocity_ned_mps",), [1.0, 2.0], "three numbers"),
-        (("velocity_ned_mps",), [1.0, 2.0, "x"], "velocity_ned_mps must be"),
-        (("published_ns",), True, "integer"),
-        (("published_ns",), 2**70, "integer"),
-        (("role",), "king", "role must be one of"),
-        (("vehicle",), "", "100 characters"),
-        (("in_command",), 1, "in_command must be"),
-        (("mode",), 4, "mode must be"),
-        (("formation", "plan", "shape"), "star", "shape must be one of"),
-        (("formation", "plan", "spacing_m"), 0.0, "spacing_m must be"),
-        (("formation", "slots"), {"beta": 0}, "beta must be"),
-        (("formation", "slots"), [1], "must be an object"),
-        (("formation", "structure", "origin"), [0.0, 0.0, 1e9], "origin must be"),
+        (("latitude_deg",), 91.0),
+        (("latitude_deg",), math.nan),
+        (("velocity_ned_mps",), [1.0, 2.0]),
+        (("velocity_ned_mps",), [1.0, 2.0, "x"]),
+        (("published_ns",), True),
+        (("published_ns",), 2**70),
+        (("role",), "king"),
+        (("vehicle",), ""),
+        (("in_command",), 1),
+        (("mode",), 4),
+        (("formation", "plan", "shape"), "star"),
+        (("formation", "plan", "spacing_m"), 0.0),
+        (("formation", "slots"), {"beta": 0}),
+        (("formation", "slots"), [1]),
+        (("formation", "structure", "origin"), [0.0, 0.0, 1e9]),
     ],
 )
-def test_invalid_field_is_rejected_by_name(path: Sequence[str | int], value: object, words: str) -> None:
+def test_invalid_field_is_rejected_by_name(path: Sequence[str], value: object) -> None:
     message = json.loads(json.dumps(pose_message(POSE)))
     inner = message
     for key in path[:-1]:
         inner = inner[key]
     inner[path[-1]] = value
-    with pytest.raises(PoseError, match=words):
+    with pytest.raises(PoseError, match=rf"^pose\.{'.'.join(path)}.*, got"):
         pose_from_message(message)
 
 
@@ -138,7 +138,7 @@ def test_invalid_field_is_rejected_by_name(path: Sequence[str | int], value: obj
 def test_missing_field_is_rejected(key: str) -> None:
     message: dict[str, Any] = {**pose_message(POSE)}
     del message[key]
-    with pytest.raises(PoseError, match=f"{key} is missing"):
+    with pytest.raises(PoseError, match=f"{key}: Field required"):
         pose_from_message(message)
 
 

@@ -127,7 +127,8 @@ class World:
         self.assembler.on_result(self.camera, result)
 
     def pose(self, receipt_ns: int) -> None:
-        pose = Pose("alpha", "a", receipt_ns, 0.0, 47.0, 8.0001, 505.0, (0.0, 0.0, 0.0), 0.0, 0.0)
+        place = (47.0, 8.0001, 505.0)
+        pose = Pose("alpha", "a", receipt_ns, 0.0, *place, (0.0, 0.0, 0.0), 0.0, 0.0, "alone", True, None)
         self.assembler.poses.on_message(json.dumps(pose_message(pose)).encode(), receipt_ns)
 
     def velocity(self, receipt_ns: int) -> None:
