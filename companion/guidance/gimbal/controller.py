@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus, Outcome
 from companion.guidance.gimbal.pointing import Pointing
@@ -50,20 +49,8 @@ SHOWN_WITHIN_S = 2.5
 _UNKNOWN_OWNER = "primary control is not reported by its manager"
 
 
-class GimbalCommand(StrEnum):
-    """Requests to a gimbal manager."""
-
-    TAKE = "take"
-    POINT = "point"
-    GIVE_BACK = "give_back"
-
-
-@dataclass(frozen=True, slots=True)
-class GimbalRequest:
-    """One request; `aim` is for POINT."""
-
-    ask: GimbalCommand
-    aim: GimbalAim | None = None
+# What is requested of a gimbal manager.
+GimbalRequest = TakeGimbal | PointGimbal | ReleaseGimbal
 
 
 class GimbalControl:
@@ -120,7 +107,7 @@ class GimbalControl:
         if self._asked is not None:
             return None
         if aim is None or self.problem:
-            return self._ask(GimbalRequest(GimbalCommand.GIVE_BACK)) if self._ours(now_ns, gimbal) else None
+            return self._ask(ReleaseGimbal()) if self._ours(now_ns, gimbal) else None
         if not self.held or self._doubted_ns is not None:
             if self._unsure(now_ns, gimbal):
                 return None
@@ -128,26 +115,26 @@ class GimbalControl:
                 self.problem = why
                 return None
             self._taken_from = None if gimbal is None else gimbal.primary_control
-            return self._ask(GimbalRequest(GimbalCommand.TAKE))
+            return self._ask(TakeGimbal())
         if now_ns - self._pointed_ns < AIM_PERIOD_S * 1e9 or _same(aim, self.pointed):
             return None
         self._pointed_ns = now_ns
-        return self._ask(GimbalRequest(GimbalCommand.POINT, aim))
+        return self._ask(PointGimbal(aim))
 
     def answered(self, now_ns: int, refused: str | None) -> None:
         """Handle the answer to the pending request."""
         asked, self._asked = self._asked, None
         if asked is None:
             return
-        match asked.ask:
-            case GimbalCommand.TAKE if refused is None:
+        match asked:
+            case TakeGimbal() if refused is None:
                 self.held, self._taken_ns, self._shown, self._doubted_ns = True, now_ns, False, None
                 self._pointed_ns = -math.inf
-            case GimbalCommand.POINT if refused is None:
-                self.pointed = asked.aim
-            case GimbalCommand.GIVE_BACK if refused is None:
+            case PointGimbal(aim) if refused is None:
+                self.pointed = aim
+            case ReleaseGimbal() if refused is None:
                 self.held, self._doubted_ns = False, None
-            case GimbalCommand.GIVE_BACK:
+            case ReleaseGimbal():
                 # Possibly still ours: released again when the manager shows it, at a limited rate.
                 self._doubted_ns, self._give_back_due_ns = now_ns, now_ns + SHOWN_WITHIN_S * 1e9
             case _:
@@ -245,7 +232,7 @@ class GimbalController:
     def __init__(self, mounting: GimbalMounting) -> None:
         self.mounting = mounting
         self._control = GimbalControl()
-        self._asked: tuple[int, GimbalCommand, int] | None = None
+        self._asked: tuple[int, GimbalRequest, int] | None = None
         self._find: int | None = None
         self._not_found = False
         self._search_due_ns = 0
@@ -329,10 +316,10 @@ class GimbalController:
         if answer.identifier == self._find:
             self._find, self._not_found = None, answer.refused is not None
         elif self._asked is not None and answer.identifier == self._asked[0]:
-            ask, self._asked = self._asked[1], None
+            asked, self._asked = self._asked[1], None
             self._control.answered(now_ns, answer.refused)
             self._report_problem(out)
-            if ask is GimbalCommand.GIVE_BACK:
+            if isinstance(asked, ReleaseGimbal):
                 if answer.refused is not None and not self._release_failed:
                     text = f"gimbal: release of control refused: {answer.refused}"
                     out.event(EventKind.GIMBAL, "", text, warning=True)
@@ -356,7 +343,7 @@ class GimbalController:
             aim, owner = self._point.pointing.aim, self._point
         request = self._control.update(now_ns, state.gimbal, aim, owner)
         if request is not None:
-            self._asked = (out.request(_action(request)), request.ask, now_ns)
+            self._asked = (out.request(request), request, now_ns)
         self._report_problem(out)
         if self._point is not None:
             self._judge(self._point, now_ns, state, out)
@@ -383,7 +370,7 @@ class GimbalController:
         if request is None:
             self.released = True
         else:
-            self._asked, self._last_try = (out.request(_action(request)), request.ask, now_ns), True
+            self._asked, self._last_try = (out.request(request), request, now_ns), True
             self._ending_since_ns = now_ns
 
     def _end_point(self, outcome: Outcome, out: OutputCollector) -> None:
@@ -486,9 +473,3 @@ def direction_text(aim: GimbalAim) -> str:
     if aim.yaw_frame is YawFrame.NORTH:
         return f"{words}, bearing {yaw % 360}°"
     return words if yaw == 0 else f"{words}, {abs(yaw)}° to the {'right' if yaw > 0 else 'left'}"
-
-
-def _action(request: GimbalRequest) -> TakeGimbal | PointGimbal | ReleaseGimbal:
-    if request.aim is not None:
-        return PointGimbal(request.aim)
-    return TakeGimbal() if request.ask is GimbalCommand.TAKE else ReleaseGimbal()

@@ -6,18 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.gimbal.controller import SHOWN_WITHIN_S, GimbalCommand, GimbalControl, GimbalRequest
+from companion.guidance.gimbal.controller import SHOWN_WITHIN_S, GimbalControl, GimbalRequest
+from companion.guidance.interface import PointGimbal, ReleaseGimbal, TakeGimbal
 from companion.vehicle.gimbal import CONTROL_MAX_AGE_S, NOBODY, GimbalAim, GimbalState
 
 OURS, STATION, AUTOPILOT = (1, 191), (245, 190), (1, 1)
 DOWN, LEVEL = GimbalAim(-0.5), GimbalAim(0.0)
-TAKE, GIVE_BACK = GimbalRequest(GimbalCommand.TAKE), GimbalRequest(GimbalCommand.GIVE_BACK)
+TAKE, GIVE_BACK = TakeGimbal(), ReleaseGimbal()
 SEEK = object()
 UNKNOWN_OWNER = "not reported"
-
-
-def point(aim: GimbalAim) -> GimbalRequest:
-    return GimbalRequest(GimbalCommand.POINT, aim)
 
 
 class Bench:
@@ -45,7 +42,7 @@ class Bench:
         assert self.turn(DOWN) == TAKE
         self.answer()
         self.shows(OURS)
-        assert self.turn(DOWN) == point(DOWN)
+        assert self.turn(DOWN) == PointGimbal(DOWN)
         self.answer()
         assert self.control.held
 
@@ -56,11 +53,11 @@ def test_control_is_taken_pointed_and_released() -> None:
     assert bench.turn(DOWN) == TAKE
     assert bench.turn(DOWN) is None, "one request at a time"
     bench.answer()
-    assert bench.turn(DOWN) == point(DOWN)
+    assert bench.turn(DOWN) == PointGimbal(DOWN)
     bench.answer()
     assert bench.control.pointed == DOWN
     assert bench.turn(DOWN) is None, "pointed already"
-    assert bench.turn(LEVEL) == point(LEVEL)
+    assert bench.turn(LEVEL) == PointGimbal(LEVEL)
     bench.answer()
     assert bench.turn(None, None) == GIVE_BACK
     bench.answer()
@@ -72,7 +69,7 @@ def test_moving_aim_is_sent_at_10_hz() -> None:
     bench.held()
     asked = [bench.turn(GimbalAim(-0.5 - 0.01 * n), seconds=0.02) for n in range(1, 51)]
     for request in asked:
-        assert request is None or request.ask is GimbalCommand.POINT
+        assert request is None or isinstance(request, PointGimbal)
         if request is not None:
             bench.answer()
     assert 1 <= sum(request is not None for request in asked) <= 11
@@ -120,7 +117,7 @@ def test_stale_status_is_not_a_loss_of_control() -> None:
     assert bench.turn(DOWN) == TAKE
     bench.answer()
     bench.shows(AUTOPILOT)
-    assert bench.turn(DOWN) == point(DOWN)
+    assert bench.turn(DOWN) == PointGimbal(DOWN)
     bench.answer()
     bench.shows(AUTOPILOT)
     bench.turn(DOWN, seconds=3.0)
@@ -131,7 +128,7 @@ def test_after_a_denial_it_is_released_only_if_ours() -> None:
     for shown, asked in ((STATION, None), (AUTOPILOT, None), (OURS, GIVE_BACK)):
         bench = Bench()
         bench.held()
-        assert bench.turn(LEVEL) == point(LEVEL)
+        assert bench.turn(LEVEL) == PointGimbal(LEVEL)
         bench.answer("denied")
         assert bench.control.problem == "denied"
         assert bench.turn(LEVEL) is None, "owner not known yet"
@@ -150,7 +147,7 @@ def test_refused_control_is_not_requested_again() -> None:
 def test_after_a_denial_a_new_owner_requests_control() -> None:
     bench = Bench()
     bench.held()
-    assert bench.turn(LEVEL) == point(LEVEL)
+    assert bench.turn(LEVEL) == PointGimbal(LEVEL)
     bench.answer("denied")
     another = object()
     assert bench.turn(DOWN, another) is None, "owner not known yet"
@@ -161,7 +158,7 @@ def test_after_a_denial_a_new_owner_requests_control() -> None:
 def test_after_a_denial_the_actual_owner_keeps_control() -> None:
     bench = Bench()
     bench.held()
-    assert bench.turn(LEVEL) == point(LEVEL)
+    assert bench.turn(LEVEL) == PointGimbal(LEVEL)
     bench.answer("denied")
     another = object()
     assert bench.turn(DOWN, another) is None
