@@ -2,7 +2,8 @@
 
 Many flights of a behaviour cannot each run a network. Here boxes are off by a share of their size, single
 frames miss an object, what is half hidden is seen with less confidence, and now and then something is seen
-that is not there. Objects are upright boxes on level ground, which hide each other.
+that is not there. Objects are upright boxes on level ground, which hide each other: a box bounds what is left
+to see of an object.
 """
 
 from __future__ import annotations
@@ -126,8 +127,8 @@ class SyntheticDetector:
             thing = self._things[outline.thing]
             missed, shake = rng.random() < faults.missed, rng.normal(0.0, faults.jitter, 4)
             unsure, far = rng.normal(0.0, 0.06), rng.normal(0.0, faults.range_sigma)
-            sides = np.tile(outline.xyxy[2:] - outline.xyxy[:2], 2)
-            visible = outline.inside * (1.0 - _hidden(outline, outlines))
+            shown, share = _not_hidden(outline, outlines)
+            sides, visible = np.tile(shown[2:] - shown[:2], 2), outline.inside * share
             if (
                 not thing.class_name
                 or thing.hidden(seconds)
@@ -136,7 +137,7 @@ class SyntheticDetector:
                 or sides.min() < LEAST_PIXELS
             ):
                 continue
-            box = outline.xyxy + shake * sides
+            box = shown + shake * sides
             boxes.append(box)
             confidences.append(0.15 + 0.65 * min(1.0, visible / 0.8) + unsure)
             classes.append(self.class_names.index(thing.class_name))
@@ -233,13 +234,25 @@ def _corners(thing: SceneObject) -> NDArray[np.float64]:
     return np.asarray(corners, np.float64)
 
 
-def _hidden(outline: _Outline, outlines: Sequence[_Outline]) -> float:
-    """Share of an outline that what is nearer covers; the most by one of them."""
-    area = float(np.prod(outline.xyxy[2:] - outline.xyxy[:2]))
-    worst = 0.0
+def _not_hidden(outline: _Outline, outlines: Sequence[_Outline]) -> tuple[NDArray[np.float64], float]:
+    """The box around what is left of an outline behind what is nearer, and its share of the outline.
+
+    A nearer outline that spans the box moves the edge that it covers; one that covers a corner moves none.
+    """
+    box, least = outline.xyxy.copy(), 1.0
+    area = float(np.prod(box[2:] - box[:2]))
     for other in outlines:
         if other.thing == outline.thing or other.nearest_m >= outline.nearest_m:
             continue
         low, high = np.maximum(outline.xyxy[:2], other.xyxy[:2]), np.minimum(outline.xyxy[2:], other.xyxy[2:])
-        worst = max(worst, float(np.prod(np.maximum(high - low, 0.0))) / area)
-    return worst
+        least = min(least, 1.0 - float(np.prod(np.maximum(high - low, 0.0))) / area)
+        for along in (0, 1):
+            across = 1 - along
+            if other.xyxy[across] > box[across] or other.xyxy[across + 2] < box[across + 2]:
+                continue
+            begin, end = other.xyxy[along], other.xyxy[along + 2]
+            if begin <= box[along]:
+                box[along] = max(box[along], min(end, box[along + 2]))
+            elif end >= box[along + 2]:
+                box[along + 2] = min(box[along + 2], begin)
+    return box, min(least, float(np.prod(box[2:] - box[:2])) / area)
