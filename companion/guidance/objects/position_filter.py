@@ -122,6 +122,10 @@ class PositionFilter:
         self._fuse(place, covariance)
         self._note_whole(target)
 
+    def predict(self, now_ns: int) -> None:
+        """Go on without a detection that says where it is."""
+        self.motion = self.motion.at(now_ns)
+
     def _moves(self, target: Target, vehicle: Vector3) -> bool:
         now_ns, longest_s = target.captured_ns, DISPLACED[-1][0]
         sigma_m = largest_sigma(_covariance(target, vehicle))

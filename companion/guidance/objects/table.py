@@ -296,6 +296,8 @@ class _Frame:
     def _take(self, known: _Object, target: Target) -> None:
         """A detection is of this object."""
         if self._partly_hidden(known, target):
+            if known.filter is not None:
+                known.filter.predict(self._now_ns)
             self._own(known, target)
             self._left = [each for each in self._left if each is not target]
             return

@@ -46,7 +46,8 @@ def test_nothing_before_it_leaves_the_box_whole() -> None:
 )
 def test_nearer_box_over_its_span_moves_one_edge(size_m: Vector3, east_m: float, edge: int) -> None:
     box = car_behind(thing("", size_m, 14.0, east_m))
-    assert ALONE is not None and box is not None
+    assert ALONE is not None
+    assert box is not None
     assert np.flatnonzero(box != ALONE).tolist() == [edge]
     middle = (ALONE[edge] + ALONE[edge - 2]) / 2
     assert abs(box[edge] - middle) < abs(ALONE[edge] - middle) - 5.0

@@ -235,3 +235,23 @@ def test_nearest_object_ahead_is_chosen() -> None:
     # Away from the nose only the direction counts.
     assert chosen((30.0, 1.0), (5.0, 5.0)) == (30.0, 1.0)
     assert chosen((5.0, 5.0), (30.0, 12.0)) == (30.0, 12.0)
+
+
+def test_hidden_lower_edge_leaves_the_object_on_its_way() -> None:
+    """Its box ends where a nearer one begins: the range by the ground is too long."""
+    table, vehicle = ObjectTable(), (0.0, 0.0, -3.0)
+    for frame in range(40):
+        seconds = frame * FRAME_S
+        hidden = seconds > 2.5
+        car = (12.0, SPEED_MPS * (seconds - 2.0))
+        far = seen((car[0] + (4.0 if hidden else 0.0), car[1]), vehicle, seconds, 1)
+        near = seen((8.0, car[1]), vehicle, seconds, 2)
+        far = replace(far, box_xyxy=(300.0, 200.0, 400.0, 230.0 if hidden else 250.0))
+        near = replace(near, box_xyxy=(280.0, 225.0, 420.0, 290.0) if hidden else (0.0, 225.0, 140.0, 290.0))
+        table.update([far, near], vehicle, far.captured_ns)
+        known = table.of_track(1)
+        assert known is not None
+        assert known.position_ned_m is not None
+        assert not known.occluded
+        if seconds > 2.0:
+            assert math.dist(known.position_ned_m[:2], car) < 0.5
