@@ -331,9 +331,8 @@ class Fleet:
 
     def _publish(self, member: Member) -> None:
         flight = member.flight
-        pose = flight.inputs.poses.pose(
-            flight.state, member.behaviour, flight.now_ns, in_command=flight.guidance.in_command
-        )
+        note = None if member.behaviour is None else member.behaviour.note
+        pose = flight.inputs.poses.pose(flight.state, note, flight.now_ns, in_command=flight.guidance.in_command)
         if pose is None or member.muted:
             return
         message: Any = pose

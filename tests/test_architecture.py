@@ -78,7 +78,6 @@ GUIDANCE_LAYERS = {
     "grammar": 6,
     "limits": 7,
     "missions": 7,
-    "pose_sharing": 7,
     "authority": 8,
     "avoidance": 8,
     "command_queue": 8,

@@ -19,9 +19,9 @@ from companion.bus.topics import command_id
 from companion.geometry.fence import Polygon
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.core import Guidance
+from companion.guidance.formation.neighbours import Neighbours
 from companion.guidance.gimbal.controller import GimbalController
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.pose_sharing import PoseSharing
 from companion.perception.cameras import PerceptionCamera, WorkerCamera
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.vehicle.autopilot_parameters import AutopilotParameters
@@ -45,7 +45,7 @@ def status_message(
     streamer: Streamer,
     cameras: Sequence[WorkerCamera],
     steering: PerceptionCamera,
-    poses: PoseSharing,
+    poses: Neighbours,
     parameters: AutopilotParameters,
     bus: Bus,
     others: list[OtherCommanderBody],
@@ -124,7 +124,7 @@ def status_message(
         "gimbal": _gimbal(guidance.gimbal, now_ns, state),
         "neighbours": {
             "ages_s": poses.ages_s(now_ns),
-            "out_of_order": poses.out_of_order,
+            "out_of_order": poses.refused,
         },
         "bus": {
             "connected": bus.connected,

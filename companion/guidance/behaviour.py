@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
+from companion.guidance.formation.pose import FormationNote
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.in_view import ObjectsInView
@@ -242,6 +243,8 @@ class Behaviour(ABC):
     neighbour_names: tuple[str, ...] = ()
     # Pitches that the gimbal must reach, radians above the horizon, if it requires GIMBAL.
     gimbal_pitches_rad: tuple[float, ...] = ()
+    # Its part in a formation, published with the vehicle's pose.
+    note: FormationNote | None = None
     # Behaviours that it begins later. What they need is checked before it begins, except `OF_THE_MOMENT`.
     later: Sequence[Behaviour] = ()
     # Replaced, never extended: a subclass need not call an `__init__`.

@@ -14,13 +14,12 @@ from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
-from companion.guidance.formation.neighbours import Neighbourhood
+from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
 from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
 from companion.guidance.objects.from_detections import StateHistory
 from companion.guidance.objects.from_markers import NO_MARKERS, LocalizedMarkers
-from companion.guidance.pose_sharing import PoseSharing
 from companion.guidance.search_pattern import Footprint
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.freeze_reports import FreezeReports
@@ -66,7 +65,7 @@ class InputAssembler:
         self._cameras = {camera.name: camera for camera in cameras}
         self.steering = next(camera for camera in cameras if camera.name == settings.guidance.camera)
         self.history = StateHistory()
-        self.poses = PoseSharing(settings.vehicle.name, on_event)
+        self.poses = Neighbours(settings.vehicle.name, on_event)
         self.velocities = VelocitySenders()
         self.parameters = NOTHING_READ
         self._alone = Neighbourhood(settings.vehicle.name)

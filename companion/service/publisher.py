@@ -225,7 +225,8 @@ class Publisher:
         bus.publish(topics.VEHICLE, lambda: vehicle_message(state, now_ns))
         # By the clock that counts a suspend: until guidance's next step the state may be from before it.
         clock_ns = self._driver.watch.now_ns()
-        pose = self._inputs.poses.pose(state, guidance.active, clock_ns, in_command=guidance.in_command)
+        note, in_command = None if guidance.active is None else guidance.active.note, guidance.in_command
+        pose = self._inputs.poses.pose(state, note, clock_ns, in_command=in_command)
         if pose is not None:
             bus.publish(topics.POSE, lambda: pose_message(pose))
         if guidance.in_command:

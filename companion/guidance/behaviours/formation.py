@@ -171,7 +171,7 @@ class FormationBehaviour(Behaviour):
         self._led: bool | None = None
         self._words = "waiting for the others"
         self._side = 1.0
-        self.note: FormationNote | None = None
+        self.note = None
         self.slot_offset_ned_m: Vector3 | None = None
 
     def on_activate(self, context: BehaviourContext) -> None:

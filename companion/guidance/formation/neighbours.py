@@ -1,4 +1,4 @@
-"""Neighbours: the received poses of other vehicles, predicted to now in the own local frame.
+"""Neighbours: the poses that vehicles share, the others' predicted to now in the own local frame.
 
 Age of a pose: its age when sent, plus the message's additional delay (`SenderDelay`), plus the time since
 receipt. It is too small by the network's minimum delay, a few milliseconds on a radio network (1–2 cm at
@@ -7,11 +7,13 @@ receipt. It is too small by the network's minimum delay, a few milliseconds on a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 from companion.geometry.geodesy import north_east
-from companion.guidance.formation.pose import FormationNote, Pose, global_problem
+from companion.guidance.formation.pose import FormationNote, Pose, global_problem, pose_from_message, pose_of
+from companion.peer_data import parse_object
 from companion.vehicle.clock_sync import SenderDelay
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
@@ -157,35 +159,53 @@ class _Received:
     delay_s: float
 
 
-@dataclass
 class Neighbours:
-    """The newest pose of every other vehicle.
+    """Shares poses: keeps the newest one of every other vehicle, and makes the own one.
+
+    A pose is published only while the global position is known; without one the others treat it as silent.
 
     Args:
-        own: the name of this vehicle. source: identifier of its own messages.
+        vehicle: its name. on_event: called with (level, text) for events.
 
     Attributes:
+        vehicle: its name. source: random identifier of this run of the service.
+        received: a pose of another vehicle was received, at any time.
         namesakes: other sources that publish under our own name.
         refused: count of messages older than the newest one.
     """
 
-    own: str
-    source: str
-    namesakes: set[str] = field(default_factory=set)
-    refused: int = 0
-    _received: dict[str, _Received] = field(default_factory=dict)
+    def __init__(self, vehicle: str, on_event: Callable[[str, str], None] = lambda level, text: None) -> None:
+        self.vehicle, self._on_event = vehicle, on_event
+        self.source = uuid.uuid4().hex[:12]
+        self.namesakes: set[str] = set()
+        self.refused, self.received = 0, False
+        self._valid_from_ns = 0
+        self._received: dict[str, _Received] = {}
 
-    def discard_received(self) -> None:
-        """What was received is outdated."""
+    def discard_received(self, now_ns: int) -> None:
+        """What was received until now is outdated, also where it is processed later."""
+        self._valid_from_ns = now_ns
         self._received.clear()
+
+    def on_message(self, payload: bytes, receipt_ns: int) -> None:
+        """Handle a message on any vehicle's `pose` topic, received at that time (CLOCK_MONOTONIC ns).
+
+        Raises:
+            PoseError: the message is not valid.
+        """
+        if receipt_ns >= self._valid_from_ns:
+            self.ingest(pose_from_message(parse_object(payload)), receipt_ns)
 
     def ingest(self, pose: Pose, receipt_ns: int) -> None:
         """Handle a pose received at that time, CLOCK_MONOTONIC nanoseconds of this host."""
-        name = pose.vehicle
-        if name == self.own:
-            if pose.source == self.source:
-                return
-            # Another vehicle with our name: keep away from it, under a name that cannot be followed.
+        if pose.source == self.source:
+            return
+        name, self.received = pose.vehicle, True
+        if name == self.vehicle:
+            # Keep away from it, under a name that cannot be followed.
+            if pose.source not in self.namesakes:
+                text = f"duplicate vehicle.name {name!r} on the network: give each service its own"
+                self._on_event("error", text)
             self.namesakes.add(pose.source)
             name = f"{name} ({pose.source})"
         before = self._received.get(name)
@@ -203,7 +223,7 @@ class Neighbours:
             name for name, received in self._received.items() if _age_s(received, now_ns) > FORGET_S
         ]:
             del self._received[name]
-        alone = anchored(Neighbourhood(self.own), state, now_ns)
+        alone = anchored(Neighbourhood(self.vehicle), state, now_ns)
         if (anchor := alone.anchor) is None:
             return alone
         vehicles = tuple(
@@ -212,10 +232,26 @@ class Neighbours:
         )
         return replace(alone, vehicles=vehicles)
 
-    def leads(self) -> bool:
-        """Whether another vehicle follows this one."""
+    def pose(
+        self, state: VehicleState, note: FormationNote | None, now_ns: int, *, in_command: bool
+    ) -> Pose | None:
+        """The pose to publish; None while the global position is unknown.
+
+        Args:
+            note: of the active behaviour (`Behaviour.note`).
+            in_command: whether guidance is in command of the vehicle.
+        """
         notes = (received.pose.formation for received in self._received.values())
-        return any(note is not None and note.leader == self.own for note in notes)
+        leads = any(other is not None and other.leader == self.vehicle for other in notes)
+        return pose_of(
+            state,
+            now_ns,
+            vehicle=self.vehicle,
+            source=self.source,
+            role="follower" if note is not None else "leader" if leads else "alone",
+            formation=note,
+            in_command=in_command,
+        )
 
     def ages_s(self, now_ns: int) -> dict[str, float]:
         """Age of each vehicle's pose, seconds."""

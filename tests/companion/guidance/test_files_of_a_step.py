@@ -98,7 +98,6 @@ ABSENT = (
     "companion/guidance/formation/pose.py",
     "companion/guidance/gimbal/controller.py",
     "companion/guidance/limits/obstacles.py",
-    "companion/guidance/pose_sharing.py",
     "companion/perception/freeze_reports.py",
     "companion/perception/marker_tracker.py",
     "companion/service/velocity_senders.py",

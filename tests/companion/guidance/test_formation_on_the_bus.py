@@ -56,7 +56,7 @@ class Companion:
         while True:
             pose = self.poses.pose(
                 self.driver.state,
-                self.guidance.behaviour,
+                None if self.guidance.behaviour is None else self.guidance.behaviour.note,
                 time.monotonic_ns(),
                 in_command=self.guidance.in_command,
             )

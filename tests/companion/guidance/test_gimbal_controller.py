@@ -55,7 +55,7 @@ class ControllerHarness:
         for _ in range(count):
             self.vehicle.now_ns += 50_000_000
             now_ns = self.vehicle.now_ns
-            self.out.begin(now_ns)
+            self.out.now_ns, self.out.requests, self.out.events = now_ns, [], []
             answers, self._answers = self._answers, []
             for answer in answers:
                 self.controller.take_answer(answer, now_ns, self.out)
@@ -179,7 +179,6 @@ def test_waiting_point_command_is_answered_at_the_end() -> None:
         attitude=(1.0, 0.0, 0.0, 0.0),
         information_ns=now_ns,
     )
-    harness.out.begin(now_ns)
     harness.controller.point(7, GimbalAim(-0.5), BehaviourContext(now_ns, harness.state), harness.out)
     assert harness.out.results == []
     harness.run(None, 1, ending=True)

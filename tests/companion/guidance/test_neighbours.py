@@ -63,7 +63,7 @@ def test_global_conversion_round_trip(latitude: float, longitude: float, positio
 
 
 def test_different_local_origins_are_supported() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
     neighbours.ingest(pose(0), NOW_NS)
     # The own local origin differs: this vehicle is at (1, 2, -5).
     alpha = alpha_of(neighbours, NOW_NS)
@@ -71,7 +71,7 @@ def test_different_local_origins_are_supported() -> None:
 
 
 def test_age_includes_the_delay_despite_clock_offset() -> None:
-    neighbours, apart_ns = Neighbours("beta", "b"), 7_000 * SECOND
+    neighbours, apart_ns = Neighbours("beta"), 7_000 * SECOND
     delays_s = [0.1, 0.03, 0.25]
     for index, delay_s in enumerate(delays_s):
         sent_ns = index * SECOND // 10
@@ -82,7 +82,7 @@ def test_age_includes_the_delay_despite_clock_offset() -> None:
 
 
 def test_prediction_of_a_neighbour_is_limited() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
     neighbours.ingest(pose(0), NOW_NS)
     for after_s, north, silent in ((0.5, 12.0, False), (3.0, 13.0, True)):
         now_ns = NOW_NS + round(after_s * 1e9)
@@ -94,14 +94,14 @@ def test_prediction_of_a_neighbour_is_limited() -> None:
 
 
 def test_neighbour_is_removed_after_30_s_of_silence() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
     neighbours.ingest(pose(0), NOW_NS)
     assert neighbours.neighbourhood(state_at(NOW_NS + 29 * SECOND), NOW_NS + 29 * SECOND).vehicles
     assert not neighbours.neighbourhood(state_at(NOW_NS + 31 * SECOND), NOW_NS + 31 * SECOND).vehicles
 
 
 def test_late_pose_does_not_replace_a_newer_one() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
     neighbours.ingest(pose(2 * SECOND), NOW_NS)
     neighbours.ingest(pose(1 * SECOND, offset=(50.0, 0.0, 0.0)), NOW_NS + 1)
     assert neighbours.refused == 1
@@ -112,8 +112,8 @@ def test_late_pose_does_not_replace_a_newer_one() -> None:
 
 
 def test_own_message_is_ignored_and_a_namesake_is_not() -> None:
-    neighbours = Neighbours("beta", "b")
-    neighbours.ingest(pose(1, "beta", source="b"), NOW_NS)
+    neighbours = Neighbours("beta")
+    neighbours.ingest(pose(1, "beta", source=neighbours.source), NOW_NS)
     assert not neighbours.neighbourhood(state_at(NOW_NS), NOW_NS).vehicles
     neighbours.ingest(pose(1, "beta", source="other"), NOW_NS)
     others = neighbours.neighbourhood(state_at(NOW_NS), NOW_NS)
@@ -123,7 +123,7 @@ def test_own_message_is_ignored_and_a_namesake_is_not() -> None:
 
 
 def test_without_own_position_there_are_no_neighbours() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
     neighbours.ingest(pose(1), NOW_NS)
     others = neighbours.neighbourhood(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
     assert others.vehicles == ()
@@ -142,7 +142,7 @@ class Needy(Behaviour):
 
 
 def test_missing_neighbour_is_named_in_the_reply() -> None:
-    neighbours = Neighbours("beta", "b")
+    neighbours = Neighbours("beta")
 
     def words(now_ns: int) -> str | None:
         state = state_at(now_ns)
