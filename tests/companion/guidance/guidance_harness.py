@@ -403,11 +403,20 @@ class GuidanceHarness:
         return pending.result()
 
 
-def assert_failed(outcome: BehaviourOutput | None, *words: str) -> None:
+def assert_succeeded(outcome: BehaviourOutput | None, *words: str) -> Outcome:
+    """Assert a success whose reason contains all words."""
+    assert isinstance(outcome, Outcome)
+    assert outcome.success, outcome.reason
+    assert [word for word in words if word not in outcome.reason] == [], outcome.reason
+    return outcome
+
+
+def assert_failed(outcome: BehaviourOutput | None, *words: str) -> Outcome:
     """Assert a failure whose reason contains all words."""
     assert isinstance(outcome, Outcome)
-    assert not outcome.success
+    assert not outcome.success, outcome.reason
     assert [word for word in words if word not in outcome.reason] == [], outcome.reason
+    return outcome
 
 
 def flying(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:

@@ -16,7 +16,7 @@ from companion.vehicle.streamer import StreamState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.setpoints import velocity_setpoint
-from tests.companion.guidance.guidance_harness import in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, in_the_air
 
 STATION = (255, 190)
 PAUSE, CONTINUE = 0.0, 1.0
@@ -93,9 +93,7 @@ def test_orbit_ends_when_autopilot_fence_stops_it() -> None:
     flight.fly("goto forward=20 right=0", 30.0)
     identifier = flight.command("orbit radius=15 speed=2 laps=1")
     assert flight.run_until(lambda: lost(flight), 90.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(flight.outcome(identifier))
     north, east, _ = flight.vehicle.truth.position_ned_m
     assert 26.0 < math.hypot(north, east) < 29.0  # FENCE_MARGIN is 2
 

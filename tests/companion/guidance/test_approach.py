@@ -6,7 +6,7 @@ import pytest
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.objects.target import RangeSource
 from companion.guidance.objects.tracked_object import Subject
-from tests.companion.guidance.guidance_harness import Flight, assert_failed
+from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
@@ -20,9 +20,7 @@ def test_approach_stops_at_the_distance_without_overshoot(north: float, east: fl
     vehicle = KinematicVehicle()
     nearest = []
     flight = Flight(ApproachBehaviour(Subject("car"), distance_m=5.0), vehicle, [car])
-    outcome = flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car)))
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car))))
     assert outcome.reason.startswith("reached car")
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.35)
     assert min(nearest) > 4.6
@@ -35,18 +33,16 @@ def test_approach_arrives_with_noisy_ranges() -> None:
     car = SeenObject("car", 25.0, -6.0)
     vehicle = KinematicVehicle()
     flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=lambda: noise.gauss(0.0, 0.06))
-    outcome = flight.run(120.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(120.0))
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.8)
 
 
 def test_approach_retreats_when_it_starts_too_near() -> None:
     person = SeenObject("person", 2.0, 0.0)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("person"), distance_m=4.0), vehicle, [person]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(
+        Flight(ApproachBehaviour(Subject("person"), distance_m=4.0), vehicle, [person]).run(60.0)
+    )
     assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
 
 
@@ -57,9 +53,7 @@ def test_approach_keeps_its_object_when_a_nearer_appears() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         second.visible = seconds > 2.0
 
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [first, second]).run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [first, second]).run(90.0, each))
     assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
 
 
@@ -71,9 +65,7 @@ def test_approach_follows_a_walking_object() -> None:
             person.east = 0.8 * seconds
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("person")), vehicle, [person]).run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("person")), vehicle, [person]).run(90.0, each))
     assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
 
 
@@ -99,9 +91,7 @@ def test_approach_continues_when_object_reappears() -> None:
         car.visible = not 4.0 < seconds < 7.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(90.0, each))
 
 
 def test_silent_detector_brakes_and_ends_approach() -> None:
@@ -110,20 +100,14 @@ def test_silent_detector_brakes_and_ends_approach() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 4.0
 
-    outcome = flight.run(60.0, each)
-    assert outcome is not None
-    assert not outcome.success
-    assert "no detections" in outcome.reason
+    assert_failed(flight.run(60.0, each), "no detections")
     assert math.hypot(*flight.vehicle.velocity) < 0.1
 
 
 def test_approach_without_range_only_yaws() -> None:
     car = SeenObject("car", 20.0, 12.0, with_range=False)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0)
-    assert outcome is not None
-    assert not outcome.success
-    assert "range" in outcome.reason
+    assert_failed(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0), "range")
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.1
     assert vehicle.yaw_rad == pytest.approx(math.atan2(12.0, 20.0), abs=0.05)
 
@@ -135,9 +119,7 @@ def test_approach_finishes_on_bearings_when_range_is_lost() -> None:
         car.with_range = distance_to(vehicle, car) > 7.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0, each))
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.5)
 
 
@@ -151,7 +133,5 @@ def test_wrong_first_range_does_not_lose_the_object(source: RangeSource) -> None
 
     vehicle = KinematicVehicle()
     flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=noise)
-    outcome = flight.run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(60.0))
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.4)

@@ -28,6 +28,7 @@ from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBeha
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from vision.attitude import wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 
@@ -172,8 +173,7 @@ def on_circle(
     flight.driver.vehicle.vehicle.estimate.velocity_offset = velocity_error_mps
     orbit = OrbitBehaviour(radius_m, speed_mps, laps, clockwise=bool(seed % 2))
     log = flight.fly(orbit, 150.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     centre = orbit._centre
     assert centre is not None
     wide, nose = [], []
@@ -217,9 +217,7 @@ def test_takeoff_reaches_and_reports_its_height(name: str, seed: int, height_m: 
     vehicle = LockstepVehicle({"onboard": RATES_HZ}, **air(name, seed))
     flight = LockstepFlight(SimulatedDriver(vehicle), plain_settings())
     assert flight.run_until(lambda: flight.state.ready_to_arm, 30.0)
-    outcome = flight.fly(TakeoffBehaviour(height_m), 90.0).outcome
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.fly(TakeoffBehaviour(height_m), 90.0).outcome)
     altitude_m = flight.state.altitude_m
     assert altitude_m == pytest.approx(height_m, abs=0.3)
     assert outcome.reason.startswith("took off, ")

@@ -12,6 +12,7 @@ from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits, within_autopilot
 from companion.vehicle.autopilot_parameters import AutopilotParameters, FirmwareVersion
+from tests.companion.guidance.guidance_harness import assert_succeeded
 
 
 def reading(**values: float) -> AutopilotParameters:
@@ -44,8 +45,7 @@ def test_vehicle_slower_than_commanded_is_no_other_commander(fastest_mps: float)
     settings = plain_settings()
     flight = LockstepFlight.airborne(seed=5, settings=settings, parameters={"MPC_XY_VEL_MAX": fastest_mps})
     log = flight.fly("goto north=30 east=0 speed=4", 90.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     assert flight.guidance.limits.max_horizontal_speed_mps == fastest_mps
     for moment in log.moments:
         north, east, _ = moment.sent.velocity_ned_mps or (0.0, 0.0, 0.0)

@@ -13,6 +13,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import Ground, World, WorldObject, range_to
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from vision.camera_model import CameraModel, CameraMount
 
 LARGE = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
@@ -59,8 +60,7 @@ class Flight:
 
     def assert_passed(self, log: FlightLog) -> None:
         """It arrived by a way around the pillar."""
-        assert log.outcome is not None
-        assert log.outcome.success, log.outcome.reason
+        assert_succeeded(log.outcome)
         assert self.flight.vehicle.truth.collisions == 0
         assert self.nearest_m > MARGIN_M - ALLOWED_M
         assert self.aside_m > 1.0

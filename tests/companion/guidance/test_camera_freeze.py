@@ -26,7 +26,7 @@ from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
-from tests.companion.guidance.guidance_harness import in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, in_the_air
 from tests.companion.guidance.test_marker_target import pad_detection
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
@@ -253,8 +253,7 @@ def test_drawn_images_that_freeze_end_an_approach(fault: str, at_s: float) -> No
     flight = marker_flight(1)
     freeze = Freeze(flight, fault, at_s, lambda place: math.dist(place[:2], (12.0, 0.5)))
     freeze.fly(f"approach marker=7 distance={DISTANCE_M:g} speed={SPEED_MPS:g}")
-    assert freeze.outcome is not None
-    assert not freeze.outcome.success
+    assert_failed(freeze.outcome)
     assert freeze.named, freeze
     assert freeze.flown_m <= MAX_FLOWN_M[fault], freeze
     assert freeze.nearest_m >= DISTANCE_M - MARGIN_M[fault], freeze
@@ -277,8 +276,7 @@ def test_no_landing_sinks_on_with_a_frozen_camera(fault: str, target: str, seed:
     assert freeze.place is not None
     assert freeze.lowest_m >= -freeze.place[2] - (1.3 if fault == EXACT else 3.3), freeze
     assert freeze.lowest_m > 0.5, freeze
-    assert freeze.outcome is not None
-    assert not freeze.outcome.success
+    assert_failed(freeze.outcome)
     assert fault == BELOW_A_CLOCK or freeze.named, freeze
 
 

@@ -12,6 +12,7 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from mavlink_sim.lockstep import LockstepVehicle
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from vision.camera_model import CameraModel, CameraMount
 from vision.tracking import SelectRequest
 
@@ -91,8 +92,7 @@ def test_seek_prefers_a_sure_car_to_a_nearer_truck(tracker: bool) -> None:
     car, truck = standing("car", -14.0, 9.0, (4.2, 1.8, 1.5)), standing("truck", 2.0, 11.0, (7.0, 2.4, 3.0))
     seen = Flight([car, truck], 13, depth=False, tracker=tracker)
     log = seen.flight.fly("seek car", 60.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     (north, east, _), yaw_rad = seen.flight.vehicle.truth.position_ned_m, seen.flight.vehicle.truth.yaw_rad
     bearing_rad = math.atan2(9.0 - east, -14.0 - north)
     assert abs(math.remainder(bearing_rad - yaw_rad, math.tau)) < math.radians(5.0)
@@ -113,8 +113,7 @@ def test_selected_object_of_no_class_is_approached_and_held(
     seen = Flight([standing(class_name, 12.0, 1.1, size_m)], 12, depth=depth)
     track_id = seen.select(0)
     log = seen.flight.fly(f"approach track={track_id} distance=6", 90.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     assert seen.range_m(0) == pytest.approx(6.0, abs=0.5 if depth else 1.5)
     seen.flight.run(3.0)
     assert seen.range_m(0) == pytest.approx(6.0, abs=0.6 if depth else 1.6)

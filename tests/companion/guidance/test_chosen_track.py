@@ -22,7 +22,14 @@ from companion.guidance.objects.ranging import RangeMeans
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
-from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, engaged, flying
+from tests.companion.guidance.guidance_harness import (
+    Flight,
+    GuidanceHarness,
+    assert_failed,
+    assert_succeeded,
+    engaged,
+    flying,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
 
 NAMES = ("car", "person")
@@ -101,8 +108,7 @@ def test_help_and_schema_show_the_choice() -> None:
 
 
 def refused(harness: GuidanceHarness, behaviour: FollowBehaviour | OrbitBehaviour) -> str:
-    outcome = harness.command(behaviour).result()
-    assert not outcome.success
+    outcome = assert_failed(harness.command(behaviour).result())
     assert not harness.guidance.busy
     return outcome.reason
 
@@ -189,9 +195,7 @@ def test_follow_keeps_to_the_farther_car() -> None:
 def test_approach_flies_to_the_farther_car() -> None:
     near, far = car(15, 0, 1), car(25, 8, 2)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject(track_id=2)), vehicle, [near, far]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(Flight(ApproachBehaviour(Subject(track_id=2)), vehicle, [near, far]).run(60.0))
     assert outcome.reason.startswith("reached track 2 at")
     assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(5.0, abs=0.4)
 
@@ -202,9 +206,7 @@ def test_orbit_is_about_the_track() -> None:
         objects=[car(12, 0, 1), car(16, 5, 2)],
     )
     flight.latency_s = 0.0  # it begins after the first frame, as its requirement demands
-    outcome = flight.run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(60.0))
     ends = flight.track[-1]
     assert math.dist(ends[:2], (16, 5)) == pytest.approx(8.0, abs=0.6)
 
@@ -246,9 +248,7 @@ def test_object_seen_beside_the_track_never_takes_its_place(
         seen.visible = seconds < 4.0
         beside.east = max(0.0, min(4.0, 4.0 - 2.0 * (seconds - 4.0)))
 
-    outcome = Flight(behaviour, objects=[seen, beside]).run(30.0, each)
-    assert outcome is not None
-    assert not outcome.success
+    outcome = assert_failed(Flight(behaviour, objects=[seen, beside]).run(30.0, each))
     assert outcome.reason.startswith("lost track 1 for")
     assert "track 9, a car, is 0." in outcome.reason
 
@@ -294,10 +294,7 @@ def test_lost_track_far_from_all_others_names_none() -> None:
 
 def test_unconfirmed_track_is_not_flown_to() -> None:
     ghost = car(15, 0, 1, trusted=False)
-    outcome = Flight(ApproachBehaviour(Subject(track_id=1)), objects=[ghost]).run(20.0)
-    assert outcome is not None
-    assert not outcome.success
-    assert "not confirmed" in outcome.reason
+    assert_failed(Flight(ApproachBehaviour(Subject(track_id=1)), objects=[ghost]).run(20.0), "not confirmed")
 
 
 def test_wanted_is_a_class_a_track_or_a_marker() -> None:
@@ -316,9 +313,7 @@ def test_gimbal_is_kept_on_a_track_until_it_is_lost() -> None:
     flight.run(2.0)
     aim = flight.command("gimbal track=1")
     assert flight.run_until(lambda: flight.outcome(aim), 10.0)
-    outcome = flight.outcome(aim)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.outcome(aim))
 
     def off_deg() -> float:
         target = flight.inputs.steering.targets[0]
@@ -344,18 +339,14 @@ def test_gimbal_is_refused_for_a_track_that_is_not_there() -> None:
     flight.run(1.0)
     aim = flight.command("gimbal track=99")
     flight.run(0.5)
-    outcome = flight.outcome(aim)
-    assert outcome is not None
-    assert not outcome.success
-    assert "no track 99; present: 1 person" in outcome.reason
+    assert_failed(flight.outcome(aim), "no track 99; present: 1 person")
 
 
 def test_mission_step_points_the_gimbal_at_a_track() -> None:
     flight = gimbal_flight(person(0.0, 25.0))
     flight.run(2.0)
     log = flight.fly(PointGimbalBehaviour(Subject(track_id=1)), 15.0, warm_up_s=0.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     gimbal = flight.state.gimbal
     assert gimbal is not None
     assert gimbal.pitch_rad is not None

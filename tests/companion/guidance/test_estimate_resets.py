@@ -12,7 +12,14 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.interface import EventKind, GuidanceInput
-from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, in_the_air
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    assert_failed,
+    assert_succeeded,
+    engaged,
+    flying,
+    in_the_air,
+)
 from vision.camera_model import CameraModel, CameraMount
 
 RESET_NED_M = (5.0, 3.0, -1.0)
@@ -45,9 +52,7 @@ def test_goal_keeps_its_ground_position_through_a_reset(autopilot: str, reset_s:
         return flight.outcome(identifier) is not None
 
     assert flight.run_until(arrived, 40.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.outcome(identifier))
     assert distance_m(flight, goal) < 1.0  # in the autopilot's new coordinates the goal is 5.9 m from there
     assert fastest_mps < 5.5
     assert flight.state.reset_count == before.reset_count + 1
@@ -93,9 +98,7 @@ def test_invalid_position_without_gps_is_not_used(autopilot: str) -> None:
     flight.run(2.0)
     flight.vehicle.vehicle.faults.begin("gps_loss")
     assert flight.run_until(lambda: flight.outcome(identifier), 20.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(flight.outcome(identifier))
     # a failsafe may be reported before the estimator's flags, which come once a second
     assert flight.run_until(lambda: flight.state.position_valid is False, 1.5)
     assert flight.state.position_fresh(flight.now_ns)

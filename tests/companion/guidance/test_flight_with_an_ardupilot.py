@@ -11,6 +11,7 @@ import pytest
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import vehicle
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -34,8 +35,7 @@ async def test_flight_until_the_pilot_takes_over_ardupilot() -> None:
             driver, guidance = service.driver, service.guidance
             await service.until(lambda: driver.state.ready_to_arm and driver.state.home_position_ned_m)
 
-            outcome = await service.fly("takeoff 3")
-            assert outcome.success, outcome.reason
+            assert_succeeded(await service.fly("takeoff 3"))
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
             assert await service.fly("orbit radius=6 speed=2") == Outcome(True, "in progress")
@@ -62,9 +62,7 @@ async def test_flight_until_the_pilot_takes_over_ardupilot() -> None:
             assert service.streamer.sent_count == sent
             assert not guidance.in_command
 
-            stopped = await service.fly("stop")
-            assert stopped.success, stopped.reason
+            assert_succeeded(await service.fly("stop"))
             await asyncio.to_thread(simulator.wait_for_event, "mode BRAKE")  # its log comes from a thread
-            landed = await service.fly("land")
-            assert landed.success, landed.reason
+            assert_succeeded(await service.fly("land"))
             assert not driver.state.armed

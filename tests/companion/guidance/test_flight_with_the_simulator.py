@@ -11,6 +11,7 @@ from pymavlink import mavutil
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -50,8 +51,7 @@ async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
             assert not driver.state.armed
 
-            outcome = await service.fly("takeoff 3")
-            assert outcome.success, outcome.reason
+            assert_succeeded(await service.fly("takeoff 3"))
             assert driver.state.altitude_m == pytest.approx(3.0, abs=0.6)
 
             path = "follow-path 0,0 5,0 5,5 speed=2 laps=0"
@@ -81,8 +81,7 @@ async def test_flight_until_the_pilot_takes_over(kind: str) -> None:
             assert not guidance.in_command
 
             # Only an operator's new command takes the vehicle back.
-            landed = await service.fly("land")
-            assert landed.success, landed.reason
+            assert_succeeded(await service.fly("land"))
             assert not driver.state.armed
             assert service.streamer.sent_count == sent
 
@@ -99,8 +98,7 @@ async def test_goto_and_follow_path_with_the_built_in_vehicle() -> None:
             home = driver.state.home_position_ned_m
             assert home is not None
 
-            outcome = await service.fly("goto 6 -3 altitude=5 speed=4")
-            assert outcome.success, outcome.reason
+            outcome = assert_succeeded(await service.fly("goto 6 -3 altitude=5 speed=4"))
             here = driver.state.position_ned_m
             assert here is not None
             north, east, down = here

@@ -20,7 +20,7 @@ from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
-from tests.companion.guidance.guidance_harness import in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air
 from vision.camera_model import CameraModel, CameraMount
 
 CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(75.0))
@@ -74,9 +74,7 @@ def reason(log: FlightLog) -> str:
 def test_approach_stops_before_the_marker(seed: int) -> None:
     flight = flight_with(seed=seed, rate_hz=5.0)
     log = flight.fly("approach marker=7 distance=4", 60.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome
-    assert "marker 7" in log.outcome.reason
+    assert_succeeded(log.outcome, "marker 7")
     north, east, _ = flight.vehicle.truth.position_ned_m
     assert math.hypot(AHEAD_M - north, 1.0 - east) == pytest.approx(4.0, abs=0.35)
     assert not log.violations
@@ -96,8 +94,7 @@ def test_follow_keeps_its_distance_to_a_moving_marker() -> None:
             distances.append(math.hypot(goal[0] - north, goal[1] - east))
 
     log = flight.fly("follow marker=7 distance=5 duration=11", 30.0, on_tick=note)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome
+    assert_succeeded(log.outcome)
     assert np.percentile(np.abs(np.array(distances) - 5.0), 90) < 0.8
     assert not log.violations
 
@@ -112,8 +109,7 @@ def test_orbit_circles_about_the_marker() -> None:
             radii.append(math.hypot(8.0 - north, east))
 
     log = flight.fly("orbit marker=7 radius=6 speed=2 laps=0.5", 40.0, on_tick=note)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome
+    assert_succeeded(log.outcome)
     assert np.percentile(np.abs(np.array(radii) - 6.0), 90) < 0.6
 
 
@@ -155,8 +151,7 @@ def test_marker_that_disappears_ends_the_command() -> None:
         return (AHEAD_M, 1.0) if time_s < 3.0 else FAR_AWAY
 
     log = flight_with(path, rate_hz=5.0).fly("approach marker=7 distance=3 lost_timeout=2", 30.0)
-    assert log.outcome is not None
-    assert not log.outcome.success
+    assert_failed(log.outcome)
     assert reason(log).startswith("lost marker 7 for 2.")
     assert "last seen" in reason(log)
     assert log.moments[-1].seconds < 8.0
@@ -180,10 +175,7 @@ def test_other_marker_and_one_seen_briefly_are_not_flown_to() -> None:
 def test_marker_needs_detection_with_the_steering_camera() -> None:
     without = LockstepFlight.airborne(seed=1, height_m=HEIGHT_M)
     for command in ("approach marker=7", "follow marker=7", "orbit marker=7"):
-        outcome = without.fly(command, 5.0).outcome
-        assert outcome is not None
-        assert not outcome.success
-        assert "(markers.dictionary is not" in outcome.reason
+        assert_failed(without.fly(command, 5.0).outcome, "(markers.dictionary is not")
 
 
 @pytest.mark.parametrize(

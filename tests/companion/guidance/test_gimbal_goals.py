@@ -22,7 +22,7 @@ from companion.guidance.grammar import parse
 from companion.guidance.objects.tracked_object import GlobalPoint, Subject
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.gimbal_flight import PERSON_M, gimbal_flight, person
-from tests.companion.guidance.guidance_harness import flying
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, flying
 
 PLACE: Vector3 = (10.0, 14.0, -1.0)
 # Of the pointing while flying, 95 % of the time and at worst; from the estimated position, which is up to
@@ -62,14 +62,12 @@ def answered(flight: LockstepFlight, text: str) -> Outcome:
 
 def kept(flight: LockstepFlight, text: str) -> str:
     """Point it; the answer, which must be a success."""
-    outcome = answered(flight, text)
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(answered(flight, text))
     return outcome.reason
 
 
 def refused(flight: LockstepFlight, text: str) -> str:
-    outcome = answered(flight, text)
-    assert not outcome.success
+    outcome = assert_failed(answered(flight, text))
     return outcome.reason
 
 
@@ -77,8 +75,7 @@ def errors_deg(flight: LockstepFlight, text: str, point: Callable[[], Vector3]) 
     """The pointing errors while a command is flown."""
     errors: list[float] = []
     log = flight.fly(text, 40.0, on_tick=lambda: errors.append(off_deg(flight, point())), warm_up_s=0.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     return errors
 
 
@@ -186,8 +183,7 @@ def test_next_gimbal_command_replaces_it() -> None:
 def test_mission_step_points_at_a_place() -> None:
     flight = gimbal_flight(person(20.0, 12.0))
     log = flight.fly(parse(place_command(flight, PLACE)).build(NO_CONTEXT), 15.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     assert off_deg(flight, PLACE) < 3.0
 
 

@@ -30,7 +30,7 @@ from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
 from tests.companion.guidance.gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
-from tests.companion.guidance.guidance_harness import assert_failed
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
 from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
@@ -56,8 +56,7 @@ def fly(
     """Fly with an initial gimbal pitch, by default towards a person 12 m away."""
     flight = gimbal_flight(scene_object, mount=mount)
     pointed = flight.fly(PointGimbalBehaviour(GimbalAim(math.radians(begin_deg))), 20.0)
-    assert pointed.outcome is not None
-    assert pointed.outcome.success, pointed.outcome.reason
+    assert_succeeded(pointed.outcome)
     flight.run(1.0)
     return flight, flight.fly(behaviour, limit_s, each=lambda moment: each(flight, moment))
 

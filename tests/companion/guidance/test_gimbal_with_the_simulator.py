@@ -9,6 +9,7 @@ import pytest
 
 from companion.vehicle.gimbal import NOBODY, GimbalState
 from mavlink_sim.testing import running_simulator
+from tests.companion.guidance.guidance_harness import assert_failed
 from tests.companion.live_flight import STATION, LiveFlight, ground_station
 from tests.companion.service_process import TWICE
 from vision.detections import Detections
@@ -66,9 +67,7 @@ async def test_sweep_gimbal_command_and_station_takeover() -> None:
             await service.until(lambda: service.gimbal.primary_control == driver.own_address)
             await service.until(lambda: service.pitch_deg < -44.0)
             await service.until(lambda: service.pitch_deg > -6.0)
-            busy = await service.fly("gimbal pitch=0")
-            assert not busy.success
-            assert "seek" in busy.reason
+            assert_failed(await service.fly("gimbal pitch=0"), "seek")
 
             assert await asyncio.to_thread(station.wait_heartbeat, timeout=10)
             configures(*STATION)

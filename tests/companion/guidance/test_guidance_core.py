@@ -21,6 +21,7 @@ from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     ScriptedGimbal,
     assert_failed,
+    assert_succeeded,
     engaged,
     flying,
     kinds,
@@ -72,8 +73,7 @@ def test_takeoff_arms_climbs_and_ends_in_autopilot_hold(mode: FlightMode, lag_s:
     harness = GuidanceHarness(parked(mode), lag_s)
     harness.run(1.2)
     assert harness.autopilot.requests == []
-    outcome = harness.outcome(harness.command(TakeoffBehaviour(5.0)))
-    assert outcome.success, outcome.reason
+    assert_succeeded(harness.outcome(harness.command(TakeoffBehaviour(5.0))))
     assert harness.autopilot.requests[-2:] == ["arm", "takeoff 5"]
     harness.run(2.0)
     assert harness.autopilot.setpoints == []
@@ -84,8 +84,7 @@ def test_takeoff_that_px4_ends_short_is_completed() -> None:
     harness = GuidanceHarness(parked())
     harness.autopilot.takeoff_short_m = 0.6
     harness.run(0.2)
-    outcome = harness.outcome(harness.command(TakeoffBehaviour(2.5)))
-    assert outcome.success, outcome.reason
+    assert_succeeded(harness.outcome(harness.command(TakeoffBehaviour(2.5))))
     assert "offboard" in harness.autopilot.requests
     harness.run(5.0)
     assert harness.vehicle.position[2] == pytest.approx(-2.5, abs=0.45)
@@ -99,9 +98,7 @@ def test_landing_from_offboard_ends_disarmed_and_silent(
 ) -> None:
     harness = GuidanceHarness(flying(), lag_s)
     engaged(harness)
-    outcome = harness.outcome(harness.command(behaviour()))
-    assert outcome.success, outcome.reason
-    assert "disarmed" in outcome.reason
+    assert_succeeded(harness.outcome(harness.command(behaviour())), "disarmed")
     assert not harness.autopilot.state.armed
     sent = len(harness.autopilot.setpoints)
     harness.run(2.0)
@@ -112,8 +109,7 @@ def test_landing_from_offboard_ends_disarmed_and_silent(
 def test_stop_hands_over_and_stops_streaming() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.5)
     future = engaged(harness)
-    outcome = harness.outcome(harness.command(StopBehaviour()), 10.0)
-    assert outcome.success
+    assert_succeeded(harness.outcome(harness.command(StopBehaviour()), 10.0))
     assert_failed(future.result(), "replaced by ", " stop")
     sent = len(harness.autopilot.setpoints)
     harness.run(2.0)
@@ -208,9 +204,7 @@ def test_exception_in_any_hook_ends_it_and_holds(hook: str, caplog: pytest.LogCa
     engaged(harness)
     is_property = isinstance(getattr(Behaviour, hook), property)
     kind = type("Faulty", (Curious,), {hook: property(failing) if is_property else failing})
-    outcome = harness.outcome(harness.command(kind()), 5.0)
-    assert not outcome.success
-    assert "ZeroDivisionError" in outcome.reason
+    assert_failed(harness.outcome(harness.command(kind()), 5.0), "ZeroDivisionError")
     assert "Traceback" in caplog.text
     harness.run(1.0)
     assert harness.guidance.phase == "offboard"
@@ -224,9 +218,7 @@ def test_update_that_returns_nothing_ends_it(idle: bool) -> None:
     if not idle:
         engaged(harness)
     kind = type("Forgetful", (Curious,), {"update": lambda *_: None})
-    outcome = harness.outcome(harness.command(kind()), 5.0)
-    assert not outcome.success
-    assert "TypeError" in outcome.reason
+    assert_failed(harness.outcome(harness.command(kind()), 5.0), "TypeError")
     harness.run(1.0)
     assert harness.guidance.phase == ("idle" if idle else "offboard")
 
@@ -267,8 +259,7 @@ def test_exception_with_the_answer_does_not_lose_it() -> None:
                 raise ZeroDivisionError("a bug")
             return self
 
-    outcome = harness.outcome(harness.command(Faulty()), 5.0)
-    assert not outcome.success
+    assert_failed(harness.outcome(harness.command(Faulty()), 5.0))
     harness.run(1.0)
     assert harness.guidance.phase == "offboard"
     assert harness.outcome(harness.command(HoldBehaviour(duration_s=0.5)), 5.0).success

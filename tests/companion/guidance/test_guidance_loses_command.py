@@ -138,8 +138,7 @@ def test_lost_link_ends_command_without_resuming() -> None:
     future = engaged(harness)
     harness.autopilot.linked = False
     harness.autopilot.position_alive = True
-    outcome = harness.outcome(future, 10.0)
-    assert not outcome.success
+    assert_failed(harness.outcome(future, 10.0))
     sent = len(harness.autopilot.setpoints)
     harness.autopilot.linked = True
     harness.run(3.0)

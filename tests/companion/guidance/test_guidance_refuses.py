@@ -18,7 +18,14 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits
 from companion.vehicle.state import FlightMode
-from tests.companion.guidance.guidance_harness import GuidanceHarness, engaged, flying, kinds, parked
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    assert_failed,
+    engaged,
+    flying,
+    kinds,
+    parked,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
@@ -123,8 +130,7 @@ def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
 def test_goal_beyond_the_limits_is_refused_before_flight(behaviour: Behaviour, where: str) -> None:
     harness = GuidanceHarness(flying())
     harness.run(0.1)
-    outcome = harness.command(behaviour).result()
-    assert not outcome.success
+    outcome = assert_failed(harness.command(behaviour).result())
     assert outcome.reason.startswith(f"{behaviour.name} would leave ")
     assert "limits: " in outcome.reason
     assert where in outcome.reason

@@ -10,7 +10,7 @@ from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle
 
@@ -62,10 +62,7 @@ def test_hold_brakes_first_and_does_not_fly_back() -> None:
 
 
 def test_hold_ends_after_its_duration() -> None:
-    outcome = Flight(HoldBehaviour(duration_s=2.0)).run(3.0)
-    assert outcome is not None
-    assert outcome.success
-    assert "2 s" in outcome.reason
+    assert_succeeded(Flight(HoldBehaviour(duration_s=2.0)).run(3.0), "2 s")
 
 
 @pytest.mark.parametrize("clockwise", [True, False])
@@ -88,9 +85,9 @@ def test_orbit_flies_its_laps_facing_the_centre(clockwise: bool) -> None:
                 )
             )
 
-    outcome = Flight(OrbitBehaviour(10.0, 2.0, laps=2.0, clockwise=clockwise), vehicle).run(120.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(
+        Flight(OrbitBehaviour(10.0, 2.0, laps=2.0, clockwise=clockwise), vehicle).run(120.0, each)
+    )
     assert all(abs(distance - 10.0) < 0.1 for distance, *_ in seen)
     assert all(abs(speed - 2.0) < 0.2 for _, speed, *_ in seen)
     assert all(off < math.radians(3) for _, _, off, *_ in seen)
@@ -105,17 +102,12 @@ def test_orbit_reaches_a_distant_circle() -> None:
     flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, subject=Subject("car")), vehicle, [car])
     # The behaviour begins after the first frame, as its requirement demands.
     flight.latency_s = 0.0
-    outcome = flight.run(90.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(90.0))
     assert math.dist(vehicle.position[:2], (30.0, 4.0)) == pytest.approx(8.0, abs=0.6)
 
 
 def test_orbit_without_a_visible_object_ends() -> None:
-    outcome = Flight(OrbitBehaviour(subject=Subject("boat"))).run(5.0)
-    assert outcome is not None
-    assert not outcome.success
-    assert "boat" in outcome.reason
+    assert_failed(Flight(OrbitBehaviour(subject=Subject("boat"))).run(5.0), "boat")
 
 
 def test_orbit_at_its_centre_gives_finite_setpoints() -> None:

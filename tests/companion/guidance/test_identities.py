@@ -9,7 +9,7 @@ from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.objects.target import DOUBTED, RangeSource, Target
 from companion.guidance.objects.tracked_object import Subject
-from tests.companion.guidance.guidance_harness import Flight, assert_failed
+from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from tests.companion.guidance.one_object import OneObject
 
@@ -72,9 +72,7 @@ def test_approach_prefers_a_confirmed_target() -> None:
     ghost = SeenObject("car", 15.0, 0.0, track_id=1, track_score=0.6, trusted=False)
     car = SeenObject("car", 15.0, 6.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [ghost, car]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [ghost, car]).run(60.0))
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.4)
 
 
@@ -88,31 +86,23 @@ def test_approach_is_not_diverted_by_a_passing_object() -> None:
         other.north = 28.0
         car.visible = not abs(other.east) < 1.2  # hidden while the other passes
 
-    outcome = Flight(ApproachBehaviour(Subject("car")), vehicle, [car, other]).run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car, other]).run(90.0, each))
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.5)
 
 
 def test_tracked_object_may_have_low_confidence() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.12, track_id=2, track_score=0.7)
-    outcome = Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(60.0))
 
 
 def test_one_good_frame_does_not_start_an_approach() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=2, track_score=0.2)
-    outcome = Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(20.0)
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(20.0))
 
 
 def test_seek_ignores_unconfirmed_targets() -> None:
     ghost = SeenObject("car", 12.0, 4.0, track_id=1, track_score=0.6, trusted=False)
-    outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0)
-    assert outcome is not None
-    assert not outcome.success
+    outcome = assert_failed(Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0))
     assert outcome.reason.endswith(DOUBTED)
 
 
@@ -122,9 +112,7 @@ def test_seek_ends_once_the_target_is_confirmed() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.trusted = seconds > 1.5
 
-    outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[car]).run(60.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(SeekBehaviour("car", laps=1.0), objects=[car]).run(60.0, each))
 
 
 def test_seek_faces_its_find_and_not_the_neighbour() -> None:

@@ -17,7 +17,7 @@ from companion.vehicle.state import LandedState, VehicleState
 @pytest.mark.parametrize("seed", [4, pytest.param(2, marks=pytest.mark.slow)])
 def test_lands_on_the_pad_in_gusts(seed: int) -> None:
     result = land(seed, rendered=False)
-    assert result.success, result
+    assert result.success, result.reason
     assert result.values["error_m"] < 0.3
 
 

@@ -23,6 +23,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.world import Ground, World, WorldObject
+from tests.companion.guidance.guidance_harness import assert_succeeded
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_boards import Board, locate_board
@@ -194,8 +195,7 @@ def test_without_gnss_above_a_map_the_vehicle_holds_0_3_m(tmp_path: Path, seed: 
     log = flight.fly(
         "goto 2 1 altitude=3", 20.0, on_tick=lambda: errors.append(error_m(flight)), warm_up_s=0.0
     )
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome
+    assert_succeeded(log.outcome)
     identifier = flight.command("hold")
     away: list[float] = []
     for _ in range(round(4.0 / TICK_S)):

@@ -20,7 +20,7 @@ from companion.guidance.objects.table import MOST_OBJECTS, ObjectTable
 from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.state import Vector3
-from tests.companion.guidance.guidance_harness import in_the_air
+from tests.companion.guidance.guidance_harness import assert_succeeded, in_the_air
 from tests.companion.guidance.test_object_position import PERIOD_NS, T0, seen
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
@@ -305,7 +305,5 @@ def test_approach_arrives_among_wrong_boxes(seed: int) -> None:
         return flight.outcome(identifier) is not None
 
     assert flight.run_until(ended, 60.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.outcome(identifier))
     assert scene[0].range_m(flight.vehicle.truth.position_ned_m, 0.0) == pytest.approx(5.0, abs=1.5)

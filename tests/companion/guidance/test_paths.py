@@ -22,7 +22,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
-from tests.companion.guidance.guidance_harness import STEP_S, Flight
+from tests.companion.guidance.guidance_harness import STEP_S, Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
 
@@ -78,8 +78,7 @@ def test_goto_current_position_succeeds() -> None:
 def test_goto_by_latitude_needs_a_global_position() -> None:
     behaviour = GotoBehaviour(global_deg=(47.0, 8.0))
     _, outcome = active(behaviour)
-    assert not outcome.success
-    assert "not received" in outcome.reason
+    assert_failed(outcome, "not received")
 
 
 def test_goto_by_latitude_and_longitude() -> None:
@@ -132,11 +131,7 @@ def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, r
 
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
     flight = Flight(GotoBehaviour(from_home_m=(60.0, 0.0)), limits=Limits(max_distance_m=30.0))
-    outcome = flight.run(120.0)
-    assert outcome is not None
-    assert not outcome.success
-    assert "no progress" in outcome.reason
-    assert "guidance" in outcome.reason
+    assert_failed(flight.run(120.0), "no progress", "guidance")
 
 
 def test_path_passes_all_points_and_slows_at_corners() -> None:
@@ -154,8 +149,7 @@ def test_closed_path_is_repeated_from_far_away() -> None:
     points = [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)]
     vehicle = KinematicVehicle(position=[-40.0, 0.0, -5.0])
     flight, outcome = active(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
-    assert outcome.success, outcome.reason
-    assert "2 laps" in outcome.reason
+    assert_succeeded(outcome, "2 laps")
     times_by = sum(
         math.dist(a, (12, 12, -5)) > 1.0 >= math.dist(b, (12, 12, -5))
         for a, b in zip(flight.track, flight.track[1:], strict=False)

@@ -7,7 +7,13 @@ from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.vehicle.state import FlightMode
-from tests.companion.guidance.guidance_harness import STEP_S, Flight, GuidanceHarness, assert_failed
+from tests.companion.guidance.guidance_harness import (
+    STEP_S,
+    Flight,
+    GuidanceHarness,
+    assert_failed,
+    assert_succeeded,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
@@ -28,9 +34,7 @@ def active(
         each(at, vehicle)
 
     flight = Flight(behaviour, vehicle or KinematicVehicle(), objects)
-    outcome = flight.run(seconds, listen)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.run(seconds, listen))
     return outcome.reason, [*notes, *behaviour.take_notes()], flight
 
 
@@ -144,17 +148,14 @@ def test_silent_detector_stops_then_ends_the_patrol() -> None:
     def short(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = not 3.0 < seconds < 8.0
 
-    outcome = flight.run(200.0, short)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(200.0, short))
 
     flight = Flight(PatrolBehaviour(ROUND, ["car"], laps=1.0), KinematicVehicle())
 
     def silent(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
 
-    outcome = flight.run(200.0, silent)
-    assert outcome is not None
+    outcome = assert_failed(flight.run(200.0, silent))
     assert outcome.reason.endswith("for 10 s")
     assert math.hypot(*flight.vehicle.velocity) < 0.1
 

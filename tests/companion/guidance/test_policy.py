@@ -36,7 +36,14 @@ from companion.guidance.policy_network import read_network
 from companion.perception.cameras import PerceptionCamera
 from companion.service.inputs import InputAssembler
 from companion.vehicle.setpoint import Setpoint
-from tests.companion.guidance.guidance_harness import Flight, GuidanceHarness, assert_failed, engaged, flying
+from tests.companion.guidance.guidance_harness import (
+    Flight,
+    GuidanceHarness,
+    assert_failed,
+    assert_succeeded,
+    engaged,
+    flying,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 onnx = pytest.importorskip("onnx", reason="onnx is an optional extra")
@@ -109,9 +116,7 @@ def built(path: Path, more: str = "") -> Behaviour:
 def test_linear_policy_flies_to_the_distance(write: Write) -> None:
     vehicle, car = KinematicVehicle(), SeenObject("car", 18.0, 4.0)
     flight = Flight(built(write(), "distance=6"), vehicle, [car])
-    outcome = flight.run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.run(60.0))
     assert math.dist(vehicle.position[:2], (18.0, 4.0)) == pytest.approx(6.0, abs=0.35)
     bearing = math.atan2(4.0 - vehicle.position[1], 18.0 - vehicle.position[0])
     assert vehicle.yaw_rad == pytest.approx(bearing, abs=0.02)
@@ -172,9 +177,7 @@ def test_bundled_policy_hands_back_at_untrained_heights(height_m: float) -> None
 
 
 def test_observation_within_the_margin_is_flown(write: Write) -> None:
-    outcome = Flight(built(write()), KinematicVehicle(), [SeenObject("car", 31.4, 0.0)]).run(60.0)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(built(write()), KinematicVehicle(), [SeenObject("car", 31.4, 0.0)]).run(60.0))
 
 
 def test_old_target_hands_back_to_hold_and_an_event_says_so(write: Write) -> None:
@@ -216,9 +219,7 @@ def test_policy_goes_on_when_its_object_is_seen_again(write: Write) -> None:
         car.visible = not 2.0 < seconds < 5.0
         statuses.append(flown.status)
 
-    outcome = Flight(flown, vehicle, [car]).run(40.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(Flight(flown, vehicle, [car]).run(40.0, each))
     assert vehicle.position[0] == pytest.approx(12.0, abs=0.35)
     assert any(text.startswith("policy tried, ") and text.endswith(" car, waiting") for text in statuses)
 

@@ -11,7 +11,7 @@ from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.objects.target import DOUBTED
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
-from tests.companion.guidance.guidance_harness import Flight
+from tests.companion.guidance.guidance_harness import Flight, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
@@ -73,9 +73,9 @@ def test_search_finds_an_object_hidden_from_the_centre(text: str) -> None:
         car.visible = math.dist((car.north, car.east), vehicle.position[:2]) < 9.0
 
     vehicle = KinematicVehicle()
-    outcome = Flight(parse(f"seek car {text}").build(NO_CONTEXT), vehicle, [car]).run(240.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(
+        Flight(parse(f"seek car {text}").build(NO_CONTEXT), vehicle, [car]).run(240.0, each)
+    )
     bearing = math.atan2(car.east - vehicle.position[1], car.north - vehicle.position[0])
     assert abs(math.remainder(bearing - vehicle.yaw_rad, math.tau)) < math.radians(5)
     assert outcome.reason.startswith("found a car")

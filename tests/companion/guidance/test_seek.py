@@ -7,7 +7,7 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.seek import SeekBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from tests.companion.guidance.guidance_harness import Flight, assert_failed
+from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 from vision.attitude import wrap_angle
 
@@ -15,9 +15,7 @@ from vision.attitude import wrap_angle
 def found(
     flight: Flight, each: Callable[[float, KinematicVehicle], None] = lambda seconds, vehicle: None
 ) -> Outcome:
-    outcome = flight.run(90.0, each)
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.run(90.0, each))
     return outcome
 
 

@@ -23,6 +23,7 @@ from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     ScriptedGimbal,
     assert_failed,
+    assert_succeeded,
     engaged,
     flying,
 )
@@ -215,9 +216,7 @@ def test_missing_gimbal_at_the_start_is_named() -> None:
 def test_mission_step_ends_when_the_gimbal_points_there() -> None:
     pointed = PointGimbalBehaviour(GimbalAim(-0.5))
     harness = harness_with_gimbal()
-    outcome = harness.outcome(harness.command(pointed))
-    assert outcome.success
-    assert "29° down" in outcome.reason
+    assert_succeeded(harness.outcome(harness.command(pointed)), "29° down")
     stuck = harness_with_gimbal(follows=False)
     assert_failed(stuck.outcome(stuck.command(pointed)), "29° down")
 

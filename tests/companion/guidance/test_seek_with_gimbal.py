@@ -27,7 +27,7 @@ from tests.companion.guidance.gimbal_flight import (
     gimbal_flight,
     person,
 )
-from tests.companion.guidance.guidance_harness import assert_failed, in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air
 
 # Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -79,8 +79,7 @@ def pitches(log: FlightLog) -> list[float]:
 def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
     scene_object = person(bearing_deg)
     flight, log, seen = fly("seek person sweep=-60", scene_object)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     assert not log.violations
     pose, truth = scene_object.pose(0.0), flight.vehicle.truth
     bearing = math.atan2(pose.east_m - truth.position_ned_m[1], pose.north_m - truth.position_ned_m[0])
@@ -102,8 +101,7 @@ def test_mission_step_holds_until_the_gimbal_points_there() -> None:
     mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
     flight = LockstepFlight.of_vehicle(in_the_air(seed=5, height_m=HEIGHT_M, gimbal=True))
     log = flight.fly(mission, 20.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     assert [step.success for step in mission.records] == [True, True]
     assert "50° down" in mission.records[0].reason
     assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)

@@ -12,7 +12,12 @@ from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBeha
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState
-from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, assert_failed
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    Pending,
+    assert_failed,
+    assert_succeeded,
+)
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 
 
@@ -86,8 +91,7 @@ def test_takeoff_after_a_landing_step() -> None:
     behaviour = mission(
         harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}
     )
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.success, outcome.reason
+    assert_succeeded(harness.outcome(begun(harness, behaviour)))
     assert harness.autopilot.requests.count("arm") == 2
 
 
@@ -113,8 +117,7 @@ def test_on_failure_branches_are_taken() -> None:
         {"do": "hold 0.5", "name": "last", "on_success": "end"},
     ]
     behaviour = mission(harness, *steps)
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.success, outcome.reason
+    assert_succeeded(harness.outcome(begun(harness, behaviour)))
     titles = [record.title for record in behaviour.records]
     assert titles == ["hold duration=60", "other", "ignored", "last"]
     assert [record.success for record in behaviour.records] == [False, True, False, True]
@@ -128,9 +131,7 @@ def test_on_failure_rtl_or_land_still_fails_the_mission(branch: str, mode: Fligh
     harness.until(lambda: harness.vehicle.mode is mode)
     assert "descent after " in harness.guidance.status
     assert "after step 1" in harness.guidance.status
-    outcome = harness.outcome(future)
-    assert not outcome.success
-    assert "timed out" in outcome.reason
+    outcome = assert_failed(harness.outcome(future), "timed out")
     assert outcome.reason.endswith("and disarmed")
     assert not harness.vehicle.armed
 
@@ -152,8 +153,7 @@ def test_first_step_requirement_refuses_the_mission() -> None:
     assert not current.done()
     # A mission with a branch for that failure is flown.
     behaviour = mission(harness, {"do": "takeoff 3", "on_failure": "continue"}, {"do": "hold 1"})
-    outcome = harness.outcome(harness.command(behaviour))
-    assert outcome.success
+    assert_succeeded(harness.outcome(harness.command(behaviour)))
     assert_failed(current.result(), "replaced by ", " mission")
 
 
@@ -173,8 +173,7 @@ def test_refused_mode_fails_only_its_step() -> None:
         {"do": "land", "name": "down", "on_failure": "stay"},
         {"do": "hold 1", "name": "stay", "on_failure": "down"},
     )
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.success, outcome.reason
+    assert_succeeded(harness.outcome(begun(harness, behaviour)))
     assert [(record.title, record.success) for record in behaviour.records][1:] == [
         ("down", False),
         ("stay", True),
@@ -195,8 +194,7 @@ def test_refused_arming_ends_the_mission_on_the_ground() -> None:
     harness = GuidanceHarness(parked())
 
     harness.autopilot.refuse_arming = "no GPS"
-    outcome = harness.outcome(begun(harness, mission(harness, {"do": "takeoff 3"})))
-    assert not outcome.success
+    outcome = assert_failed(harness.outcome(begun(harness, mission(harness, {"do": "takeoff 3"}))))
     assert outcome.reason.endswith("no GPS")
     assert harness.guidance.phase == "idle"
     assert not harness.autopilot.setpoints
@@ -205,8 +203,7 @@ def test_refused_arming_ends_the_mission_on_the_ground() -> None:
 def test_endless_step_succeeds_at_its_timeout() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.success
+    assert_succeeded(harness.outcome(begun(harness, behaviour)))
     assert "4 s" in behaviour.records[0].reason
 
 
@@ -217,9 +214,7 @@ def test_visits_limit_ends_a_loop() -> None:
         {"do": "hold 0.2", "name": "a", "visits": 3},
         {"do": "hold 0.2", "name": "b", "on_success": "a"},
     )
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert not outcome.success
-    assert "visits limit 3" in outcome.reason
+    assert_failed(harness.outcome(begun(harness, behaviour)), "visits limit 3")
     assert [record.title for record in behaviour.records] == ["a", "b"] * 3
 
 
@@ -235,9 +230,7 @@ def test_loop_of_steps_that_fail_at_once_ends() -> None:
 def test_mission_timeout_ends_the_current_step() -> None:
     harness = GuidanceHarness(flying())
     behaviour = mission(harness, {"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert not outcome.success
-    assert "after 3 s" in outcome.reason
+    assert_failed(harness.outcome(begun(harness, behaviour)), "after 3 s")
 
 
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
@@ -304,8 +297,7 @@ def test_exception_fails_the_step_and_the_plan_goes_on() -> None:
         way_down=lambda word: HoldBehaviour(0.1),
     )
     behaviour = SequenceBehaviour(plan, harness.guidance.check_requirements)
-    outcome = harness.outcome(begun(harness, behaviour))
-    assert outcome.success
+    assert_succeeded(harness.outcome(begun(harness, behaviour)))
     assert "ZeroDivisionError" in behaviour.records[0].reason
     assert broken.left
 

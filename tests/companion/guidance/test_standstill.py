@@ -23,7 +23,14 @@ from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.state import FlightMode, LandedState
 from companion.vehicle.vehicle_type import VtolState
-from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, engaged, flying, parked
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    ScriptedGimbal,
+    assert_failed,
+    engaged,
+    flying,
+    parked,
+)
 
 LEADER = Neighbour("alpha", (20.0, 0.0, -5.0), (0.0, 0.0, 0.0), 0.0, 0.0, age_s=0.1)
 
@@ -293,8 +300,7 @@ def test_track_from_before_a_suspend_is_forgotten() -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=True)
     harness.run(1.1)
-    outcome = harness.command(ApproachBehaviour(Subject(track_id=7))).result()
-    assert not outcome.success
+    assert_failed(harness.command(ApproachBehaviour(Subject(track_id=7))).result())
 
 
 def test_waiting_command_is_answered_after_a_standstill() -> None:

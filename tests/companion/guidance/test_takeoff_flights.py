@@ -16,6 +16,7 @@ from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
 
 OLDER = ("1.14", "1.15", "1.16", "1.18")
 
@@ -29,9 +30,7 @@ def on_ground(px4: str | None = None, *, seed: int = 9, **parameters: float) -> 
 
 def test_takeoff_that_px4_ends_early_reaches_its_height() -> None:
     flight = on_ground(NAV_MC_ALT_RAD=1.6)  # 1.3 m short
-    outcome = flight.fly("takeoff 6", 90.0).outcome
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.fly("takeoff 6", 90.0).outcome)
     assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
 
 
@@ -128,9 +127,7 @@ def test_pilot_stops_the_rest_of_a_takeoff(after: FlightMode, auto_mode: int, sh
 
 def test_takeoff_of_2_5_m_reaches_its_height() -> None:
     flight = on_ground()
-    outcome = flight.fly("takeoff 2.5", 60.0).outcome
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    assert_succeeded(flight.fly("takeoff 2.5", 60.0).outcome)
     assert flight.state.altitude_m == pytest.approx(2.5, abs=0.3)
 
 
@@ -163,8 +160,7 @@ def test_estimate_that_moves_at_lift_off_is_not_chased(after_s: float) -> None:
     at_s = flight.vehicle.vehicle.faults.now_s + after_s
     flight.vehicle.vehicle.faults.begin(f"gps_drift speed=0.6 limit=1 towards=60 at={at_s}")
     log = flight.fly("takeoff 1.5", 40.0, warm_up_s=0.0)
-    assert log.outcome is not None
-    assert log.outcome.success, log.outcome.reason
+    assert_succeeded(log.outcome)
     standing = 0
     for moment in log.moments:
         velocity = moment.sent.velocity_ned_mps
@@ -197,10 +193,7 @@ def test_pilots_hold_ends_a_low_takeoff_at_any_height(acceptance_m: float | None
 def test_low_takeoff_without_offboard_is_disarmed_on_the_ground() -> None:
     flight = on_ground()
     flight.vehicle.vehicle.faults.begin("refuse_mode OFFBOARD")
-    outcome = flight.fly("takeoff 1.5", 30.0).outcome
-    assert outcome is not None
-    assert not outcome.success
-    assert "offboard" in outcome.reason
+    assert_failed(flight.fly("takeoff 1.5", 30.0).outcome, "offboard")
     assert flight.run_until(lambda: not flight.state.armed, 3.0)
     assert flight.state.landed is LandedState.ON_GROUND
 
@@ -214,9 +207,7 @@ def test_takeoff_counts_from_home_as_moved_by_arming(up_m: float) -> None:
     assert before_m is not None
     assert flight.state.altitude_m == pytest.approx(up_m, abs=0.1)  # above home as it was
     assert flight.state.landed is LandedState.ON_GROUND
-    outcome = flight.fly("takeoff 5", 90.0).outcome
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.fly("takeoff 5", 90.0).outcome)
     assert flight.state.home_altitude_amsl_m == pytest.approx(before_m + up_m, abs=0.15)
     altitude_m = flight.state.altitude_m
     assert altitude_m == pytest.approx(5.0, abs=0.3)
@@ -232,9 +223,7 @@ def test_takeoff_refused_after_arming_disarms_the_vehicle(monkeypatch: pytest.Mo
         raise CommandRefusedError("home position not received")
 
     monkeypatch.setattr(Px4Profile, "takeoff_parameters", refuse)
-    outcome = flight.fly("takeoff 4", 30.0).outcome
-    assert outcome is not None
-    assert not outcome.success
+    assert_failed(flight.fly("takeoff 4", 30.0).outcome)
     # Long before PX4 would disarm by itself (COM_DISARM_PRFLT, 10 s).
     assert flight.run_until(lambda: not flight.state.armed, 3.0)
     assert flight.state.landed is LandedState.ON_GROUND

@@ -12,6 +12,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle
 
 PARKED = replace(
@@ -70,8 +71,7 @@ def test_takeoff_times_out_with_the_height_reached() -> None:
     behaviour.on_activate(context(0))
     outcome = behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF))
     assert isinstance(outcome, Outcome)
-    assert not outcome.success
-    assert "0.0 m of 5 m" in outcome.reason
+    assert_failed(outcome, "0.0 m of 5 m")
 
 
 @pytest.mark.parametrize(
@@ -94,8 +94,7 @@ def test_land_and_rtl_end_when_disarmed(
     # After disarming PX4 shows the mode from before the landing.
     outcome = behaviour.update(0.02, context(11, mode=FlightMode.OFFBOARD))
     assert isinstance(outcome, Outcome)
-    assert outcome.success
-    assert "landed " in outcome.reason
+    assert_succeeded(outcome, "landed ")
     assert outcome.reason.endswith(" and disarmed")
 
 
@@ -155,8 +154,7 @@ def test_landing_on_the_ground_succeeds_at_once(
     behaviour.on_activate(context(0))
     outcome = behaviour.update(0.0, context(0))
     assert isinstance(outcome, Outcome)
-    assert outcome.success
-    assert "the ground" in outcome.reason
+    assert_succeeded(outcome, "the ground")
 
 
 @pytest.mark.parametrize(("kind", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
@@ -168,9 +166,7 @@ def test_land_and_rtl_time_out_with_the_landed_state(
     behaviour.on_activate(context(0, **aloft))
     outcome = behaviour.update(0.02, context(seconds, **aloft))
     assert isinstance(outcome, Outcome)
-    assert not outcome.success
-    assert "landing and " in outcome.reason
-    assert " and armed" in outcome.reason
+    assert_failed(outcome, "landing and ", " and armed")
 
 
 def test_timeout_grows_with_height_and_distance() -> None:

@@ -9,6 +9,7 @@ from companion.guidance.interface import EventKind
 from companion.vehicle.state import FlightMode
 from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.px4.modes import Mode
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
 from tests.mavlink_sim.conftest import CALIBRATION
 
 
@@ -30,9 +31,7 @@ def takeovers(flight: LockstepFlight) -> list[str]:
 @pytest.mark.parametrize("mode", [Mode.POSCTL, Mode.ALTCTL, Mode.RTL])
 def test_command_says_from_which_mode_it_took_over(mode: Mode) -> None:
     flight = flown_by(mode)
-    outcome = flight.fly("goto north=3 east=0", 40.0).outcome
-    assert outcome is not None
-    assert outcome.success, outcome.reason
+    outcome = assert_succeeded(flight.fly("goto north=3 east=0", 40.0).outcome)
     assert outcome.reason.endswith(f"; took over from {MODES[mode]} mode")
     assert takeovers(flight) == [f"goto took over from {MODES[mode]} mode"]
 
@@ -45,9 +44,7 @@ def test_endless_command_and_autopilot_mode_say_it_too() -> None:
     assert outcome is not None
     assert outcome.reason == "in progress; took over from position mode"
     flight = flown_by(Mode.POSCTL)
-    outcome = flight.fly("stop", 20.0).outcome
-    assert outcome is not None
-    assert outcome.success
+    outcome = assert_succeeded(flight.fly("stop", 20.0).outcome)
     assert outcome.reason.endswith("; took over from position mode")
 
 
@@ -70,9 +67,7 @@ def test_nobody_is_displaced_in_hold_or_on_the_ground() -> None:
 
 def test_refused_command_has_taken_nothing_over() -> None:
     flight = flown_by(Mode.POSCTL)
-    outcome = flight.fly("goto north=3000 east=0", 5.0).outcome
-    assert outcome is not None
-    assert not outcome.success
+    outcome = assert_failed(flight.fly("goto north=3000 east=0", 5.0).outcome)
     assert "took over" not in outcome.reason
     assert flight.state.mode is FlightMode.POSITION
 
