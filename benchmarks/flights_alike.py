@@ -21,7 +21,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.behaviours.follow import Follow, FollowBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
@@ -68,7 +68,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         off_m = [math.dist(place, _place(item, moment.seconds)) for item in (chosen, other)]
         followed.append((off_m[0], off_m[1], seen.ambiguous or seen.occluded))
 
-    behaviour = FollowBehaviour(Subject("car"), distance_m=DISTANCE_M, occlusion_s=OCCLUSION_S)
+    behaviour = FollowBehaviour(Follow(Subject("car"), distance_m=DISTANCE_M, occlusion_s=OCCLUSION_S))
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
     if not followed:
         return FlightResult(seed, False, {"flown_to_other": 0.0}, "nothing was chosen")

@@ -19,7 +19,7 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
@@ -50,7 +50,7 @@ def fly(
     tolerance_m: float,
     rendered: bool = False,
     command: Callable[[str], str | Behaviour] = lambda name: ApproachBehaviour(
-        Subject(name), distance_m=DISTANCE_M
+        Approach(Subject(name), distance_m=DISTANCE_M, retries=0.0)
     ),
 ) -> FlightResult:
     """One flight; its success allows an error of the final range of `tolerance_m`.

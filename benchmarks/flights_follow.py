@@ -26,7 +26,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.behaviours.follow import Follow, FollowBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 from vision.camera_model import CameraModel, CameraMount
@@ -81,7 +81,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         errors_m.append(abs(error_m))
         on_target.append(abs(error_m) <= RANGE_TOLERANCE_M and abs(off_rad) <= IMAGE_TOLERANCE_RAD)
 
-    behaviour = FollowBehaviour(Subject(class_name), distance_m=DISTANCE_M)
+    behaviour = FollowBehaviour(Follow(Subject(class_name), distance_m=DISTANCE_M))
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
     turns = max(len(on_target), round((FLIGHT_S - SETTLING_S) / _STEP_S))
     share = sum(on_target) / turns

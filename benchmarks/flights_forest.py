@@ -26,7 +26,7 @@ from benchmarks.flights import FlightResult
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.lockstep import LockstepVehicle
@@ -109,7 +109,7 @@ def run(seed: int, each: Callable[[RenderedCamera, LockstepFlight], None] | None
         if each is not None:
             each(cameras[0], flight)
 
-    goto = GotoBehaviour(from_home_m=(AWAY_M, 0.0), speed_mps=SPEED_MPS)
+    goto = GotoBehaviour(Goto(north_m=AWAY_M, east_m=0.0, speed_mps=SPEED_MPS))
     log = flight.fly(goto, FLIGHT_S, each=lambda moment: on_step())
     there = log.outcome is not None and log.outcome.success
     collisions = flight.vehicle.truth.collisions

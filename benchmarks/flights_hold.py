@@ -11,7 +11,7 @@ import random
 
 from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 
 GUSTS_MPS, LIMIT_S, HOLD_S = 0.6, 120.0, 10.0
 WITHIN_M = 0.3
@@ -21,7 +21,7 @@ def run(seed: int) -> FlightResult:
     """One flight and its hold."""
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
-    goto = GotoBehaviour(from_home_m=goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
+    goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
     flight = LockstepFlight.airborne(seed=seed, wind_mps=chance.uniform(0.0, 3.0), gusts_mps=GUSTS_MPS)
     log = flight.fly(goto, LIMIT_S)
     if log.outcome is None or not log.outcome.success or log.outcome.goal_ned_m is None:

@@ -16,7 +16,7 @@ from benchmarks.flights import FlightResult
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import World, WorldObject, range_to
@@ -64,8 +64,11 @@ def run(seed: int) -> FlightResult:
     )
     flight.turn_to(heading)
     goto = GotoBehaviour(
-        from_home_m=((away_m + 10.0) * math.cos(heading), (away_m + 10.0) * math.sin(heading)),
-        speed_mps=float(rng.uniform(2.0, 4.0)),
+        Goto(
+            north_m=(away_m + 10.0) * math.cos(heading),
+            east_m=(away_m + 10.0) * math.sin(heading),
+            speed_mps=float(rng.uniform(2.0, 4.0)),
+        )
     )
     log = flight.fly(goto, FLIGHT_S)
     ranges = [range_to(thing, moment.truth.position_ned_m) for moment in log.moments]

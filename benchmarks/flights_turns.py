@@ -18,7 +18,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.behaviours.follow import Follow, FollowBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from mavlink_sim.lockstep import LockstepVehicle
 
@@ -57,7 +57,9 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         if moment.seconds >= SETTLING_S:
             errors_m.append(abs(goal.range_m(moment.truth.position_ned_m, moment.seconds) - DISTANCE_M))
 
-    log = flight.fly(FollowBehaviour(Subject(class_name), distance_m=DISTANCE_M), FLIGHT_S, each=judge)
+    log = flight.fly(
+        FollowBehaviour(Follow(Subject(class_name), distance_m=DISTANCE_M)), FLIGHT_S, each=judge
+    )
     if log.outcome is None:
         reason = "followed to the end"
     else:

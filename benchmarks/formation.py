@@ -332,7 +332,9 @@ class Fleet:
     def _publish(self, member: Member) -> None:
         flight = member.flight
         note = None if member.behaviour is None else member.behaviour.note
-        pose = flight.inputs.poses.pose(flight.state, note, flight.now_ns, in_command=flight.guidance.in_command)
+        pose = flight.inputs.poses.pose(
+            flight.state, note, flight.now_ns, in_command=flight.guidance.in_command
+        )
         if pose is None or member.muted:
             return
         message: Any = pose

@@ -17,7 +17,7 @@ from companion.guidance.behaviour import (
     Requirement,
     RoutedSetpoint,
 )
-from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.command import (
     BuildContext,
     Command,
@@ -125,16 +125,7 @@ class Approach(Command):
             raise GrammarError(f"approach: retries must be a whole number, got {self.retries:g}")
 
     def build(self, context: BuildContext) -> Behaviour:
-        return ApproachBehaviour(
-            self.subject,
-            distance_m=self.distance_m,
-            speed_mps=self.speed_mps,
-            confidence=self.confidence,
-            lost_timeout_s=self.lost_timeout_s,
-            retries=int(self.retries) if self.subject.class_name else 0,  # a search would find another track
-            tracking=GimbalTracking() if self.gimbal == "track" else None,
-            field_rad=field_of_view_rad(context.footprint),
-        )
+        return ApproachBehaviour(self, field_of_view_rad(context.footprint))
 
 
 class ApproachBehaviour(Behaviour):
@@ -145,39 +136,28 @@ class ApproachBehaviour(Behaviour):
     once, up to `retries` times, and approaches what it finds.
 
     Args:
-        retries: how often to search for a lost object of the class.
-        tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
         field_rad: the camera's horizontal field of view.
     """
 
     name = "approach"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
-    def __init__(
-        self,
-        subject: Subject,
-        *,
-        distance_m: float = 5.0,
-        speed_mps: float = 2.0,
-        confidence: float = 0.3,
-        lost_timeout_s: float = 5.0,
-        retries: int = 0,
-        tracking: GimbalTracking | None = None,
-        field_rad: float = NARROW_FIELD_RAD,
-    ) -> None:
-        self._tracking, self._field_rad = tracking, field_rad
-        self.subject: Subject = subject
-        if tracking is not None:
+    def __init__(self, command: Approach, field_rad: float = NARROW_FIELD_RAD) -> None:
+        self._command, self._field_rad = command, field_rad
+        self.subject: Subject = command.subject
+        self._tracking = GimbalTracking() if command.gimbal == "track" else None
+        if self._tracking is not None:
             self.requirements = ApproachBehaviour.requirements | {Requirement.GIMBAL}
-        self._distance_m, self._speed_mps = distance_m, speed_mps
-        self._confidence = confidence
-        self._lost_timeout_s, self._retries = lost_timeout_s, retries
+        # A search for a track would find another one.
+        self._retries = int(command.retries) if command.subject.class_name else 0
         self._tried = 0
+        self._forget(0, 0.0)
+
+    def _forget(self, now_ns: int, down_m: float) -> None:
         self._search: _Search | None = None
         self._object: TrackedObject | None = None
-        self._down_m = 0.0
-        self._until_ns: float = math.inf
-        self._started_ns = 0
+        self._started_ns, self._down_m = now_ns, down_m
+        self._until_ns = now_ns + BASE_TIMEOUT_S * 1e9
         self._bearing_rad: float | None = None
         self._wait_point: Vector3 | None = None
         self._anchor_rad: float | None = None
@@ -189,15 +169,9 @@ class ApproachBehaviour(Behaviour):
         self._begin(context)
 
     def _begin(self, context: BehaviourContext) -> None:
-        self._search = None
         position, _ = position_and_yaw(context.state)
-        self._down_m = position[2]
-        self._started_ns = context.now_ns
-        self._until_ns = context.now_ns + BASE_TIMEOUT_S * 1e9
-        self._object = self._bearing_rad = self._wait_point = self._anchor_rad = None
+        self._forget(context.now_ns, position[2])
         context.objects.forget(self.subject)
-        self._arrival, self._controller = Arrival(), PositionController()
-        self._range_m = math.nan
         if self._tracking is not None:
             self._tracking.begin(context)
 
@@ -222,7 +196,7 @@ class ApproachBehaviour(Behaviour):
             took_s = (now_ns - self._started_ns) / 1e9
             return Outcome(False, f"did not reach {self.subject.phrase} in {took_s:.0f} s: {away}")
         # On a way around obstacles they hide the object: it is flown on to where it was last seen.
-        lost_s = self._lost_timeout_s if context.avoiding else LOST_AFTER_S
+        lost_s = self._command.lost_timeout_s if context.avoiding else LOST_AFTER_S
         blind = context.objects.fault_of(self.subject)
         if track is None or track.unseen_s(now_ns) > lost_s or blind:
             return self._wait(dt_s, context, position)
@@ -232,8 +206,8 @@ class ApproachBehaviour(Behaviour):
         bearing = math.atan2(east - position[1], north - position[0])
         if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
             self._bearing_rad = bearing
-        error_m = self._range_m - self._distance_m
-        top = self._speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._speed_mps)
+        error_m = self._range_m - self._command.distance_m
+        top = self._command.speed_mps if error_m > 0 else min(MAX_RETREAT_MPS, self._command.speed_mps)
         goal = self._goal(point, position, bearing)
         if goal is not None:
             off_m = math.inf if track.moving else math.dist(goal, position)
@@ -248,10 +222,11 @@ class ApproachBehaviour(Behaviour):
         wanted = (speed * math.cos(bearing), speed * math.sin(bearing))
         down_mps = correction(self._down_m - position[2])
         if not context.avoiding or error_m <= 0.0:
-            corrected = add_velocity_error(wanted, state, self._speed_mps)
+            corrected = add_velocity_error(wanted, state, self._command.speed_mps)
             return Setpoint.velocity((*corrected, down_mps), now_ns, yaw_rad=self._bearing_rad)
         setpoint = Setpoint.velocity((*wanted, down_mps), now_ns, yaw_rad=self._bearing_rad)
-        stop = (north - self._distance_m * math.cos(bearing), east - self._distance_m * math.sin(bearing))
+        before_m = self._command.distance_m
+        stop = (north - before_m * math.cos(bearing), east - before_m * math.sin(bearing))
         return RoutedSetpoint(setpoint, (position, (*stop, self._down_m)), facing=True)
 
     @property
@@ -279,7 +254,7 @@ class ApproachBehaviour(Behaviour):
         return f"{self.subject.phrase_now(self._object.track_id)} {self._range_m:.1f} m away"
 
     def _observe(self, context: BehaviourContext) -> None:
-        seen = context.objects.of(self.subject, self._confidence)
+        seen = context.objects.of(self.subject, self._command.confidence)
         if seen is None:
             if (target := context.objects.in_sight(self.subject)) is not None:
                 # Fully inside the image it may get a range.
@@ -288,8 +263,8 @@ class ApproachBehaviour(Behaviour):
                     self._tracking.turn_to(target, context)
             return
         if self._object is None:
-            path_m = abs(seen.detection.ground_range_m - self._distance_m)
-            self._until_ns = context.now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._speed_mps) * 1e9
+            path_m = abs(seen.detection.ground_range_m - self._command.distance_m)
+            self._until_ns = context.now_ns + (BASE_TIMEOUT_S + 3.0 * path_m / self._command.speed_mps) * 1e9
         self._object = seen
 
     def _goal(self, point: Vector3, position: Vector3, bearing: float) -> Vector3 | None:
@@ -297,8 +272,8 @@ class ApproachBehaviour(Behaviour):
         chosen = self._anchor_rad is not None
         away_rad = bearing + math.pi if self._anchor_rad is None else self._anchor_rad
         goal = (
-            point[0] + self._distance_m * math.cos(away_rad),
-            point[1] + self._distance_m * math.sin(away_rad),
+            point[0] + self._command.distance_m * math.cos(away_rad),
+            point[1] + self._command.distance_m * math.sin(away_rad),
             self._down_m,
         )
         if math.dist(goal[:2], position[:2]) >= ANCHOR_M[1 if chosen else 0]:
@@ -320,7 +295,7 @@ class ApproachBehaviour(Behaviour):
         """Object not seen: brake, hold where the vehicle comes to rest, and keep the heading."""
         if self._wait_point is None:
             self._leave_goal()
-        if (why := context.objects.lost(self.subject, self._lost_timeout_s)) is not None:
+        if (why := context.objects.lost(self.subject, self._command.lost_timeout_s)) is not None:
             if self._object is None or context.objects.fault_of(self.subject):
                 return Outcome(False, why)
             return self._look_again(why, self._object.position_at(context.now_ns), context)
@@ -365,16 +340,15 @@ class ApproachBehaviour(Behaviour):
         """Hold with the nose towards the last known position; then turn."""
         now_ns = context.now_ns
         position, yaw_rad = position_and_yaw(context.state)
-        if context.objects.of(self.subject, self._confidence) is not None:
+        if context.objects.of(self.subject, self._command.confidence) is not None:
             return self._go_there(context, f"found {self.subject.phrase} where it was")
         bearing_rad = math.atan2(search.lost_at[1] - position[1], search.lost_at[0] - position[0])
         if search.pointed_ns is None and abs(wrap_angle(bearing_rad - yaw_rad)) < POINTED_RAD:
             search.pointed_ns = now_ns
         looked_ns = 0 if search.pointed_ns is None else now_ns - search.pointed_ns
         if looked_ns > LOOK_BACK_S * 1e9 or now_ns - search.begun_ns > LOOK_BACK_LIMIT_S * 1e9:
-            search.seek = SeekBehaviour(
-                self.subject.class_name, laps=1.0, confidence=self._confidence, sweep=self._sweep()
-            )
+            turn = Seek(self.subject.class_name, laps=1.0, confidence=self._command.confidence)
+            search.seek = SeekBehaviour(turn, sweep=self._sweep())
             search.seek.on_activate(context)
             return search.seek.update(0.0, context)
         return Setpoint.velocity(stay_at(search.hold_point, position), now_ns, yaw_rad=bearing_rad)

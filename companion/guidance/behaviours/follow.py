@@ -82,32 +82,14 @@ class Follow(Command):
         return self.duration_s == 0.0
 
     def build(self, context: BuildContext) -> Behaviour:
-        return FollowBehaviour(
-            self.subject,
-            distance_m=self.distance_m,
-            bearing=self.bearing,
-            angle_rad=math.radians(self.angle_deg),
-            speed_mps=self.speed_mps,
-            confidence=self.confidence,
-            occlusion_s=self.occlusion_s,
-            duration_s=self.duration_s,
-            tracking=GimbalTracking() if self.gimbal == "track" else None,
-        )
+        return FollowBehaviour(self)
 
 
 class FollowBehaviour(Behaviour):
     """Keeps the height, yaws to the object and keeps `distance_m` over ground from its surface.
 
-    It selects the confirmed object of the class ahead, or the track or marker, and
-    stays with it. Unseen, it follows the prediction for `occlusion_s`; then it fails.
-
-    Args:
-        bearing: where the vehicle stays, seen from the object: "here", its current direction; "compass",
-            `angle_rad` clockwise from north; "course", that far clockwise from the object's direction of
-            motion (π is behind it).
-        speed_mps: at most, the object's own speed included.
-        duration_s: ends after this, with success; 0: until another command.
-        tracking: keeps the camera's gimbal on the object; None: the gimbal is not used.
+    It selects the confirmed object of the class ahead, or the track or marker, and stays with it. Unseen, it
+    follows the prediction for `occlusion_s`; then it fails. The object's own speed is part of `speed_mps`.
     """
 
     name = "follow"
@@ -119,27 +101,12 @@ class FollowBehaviour(Behaviour):
         }
     )
 
-    def __init__(
-        self,
-        subject: Subject,
-        *,
-        distance_m: float = 8.0,
-        bearing: str = "here",
-        angle_rad: float = math.pi,
-        speed_mps: float = 5.0,
-        confidence: float = 0.3,
-        occlusion_s: float = 3.0,
-        duration_s: float = 0.0,
-        tracking: GimbalTracking | None = None,
-    ) -> None:
-        self._tracking = tracking
-        self.subject: Subject = subject
-        if tracking is not None:
+    def __init__(self, command: Follow) -> None:
+        self._command = command
+        self.subject: Subject = command.subject
+        self._tracking = GimbalTracking() if command.gimbal == "track" else None
+        if self._tracking is not None:
             self.requirements = FollowBehaviour.requirements | {Requirement.GIMBAL}
-        self._distance_m, self._speed_mps = distance_m, speed_mps
-        self._bearing, self._angle_rad = bearing, angle_rad
-        self._confidence, self._occlusion_s = confidence, occlusion_s
-        self._duration_s = duration_s
         self._forget(0, 0.0)
 
     def _forget(self, now_ns: int, down_m: float) -> None:
@@ -164,13 +131,13 @@ class FollowBehaviour(Behaviour):
         self._observe(context)
         track = self._object
         self._unseen_s = 0.0 if track is None else track.unseen_s(now_ns)
-        if self._duration_s and now_ns - self._started_ns >= self._duration_s * 1e9:
+        if self._command.duration_s and now_ns - self._started_ns >= self._command.duration_s * 1e9:
             if track is None:
                 return Outcome(
-                    False, f"no localized {self.subject.name!r} to follow in {self._duration_s:g} s"
+                    False, f"no localized {self.subject.name!r} to follow in {self._command.duration_s:g} s"
                 )
-            return Outcome(True, f"followed {self.subject.phrase} for {self._duration_s:g} s")
-        if (why := context.objects.lost(self.subject, self._occlusion_s)) is not None:
+            return Outcome(True, f"followed {self.subject.phrase} for {self._command.duration_s:g} s")
+        if (why := context.objects.lost(self.subject, self._command.occlusion_s)) is not None:
             return Outcome(False, why)
         if track is not None:
             point = track.position_at(now_ns)
@@ -189,7 +156,7 @@ class FollowBehaviour(Behaviour):
 
         self._yaw_rad = towards_rad = math.atan2(east, north)
         wanted = self._wanted(track, towards_rad, dt_s)
-        north_mps, east_mps = add_velocity_error(wanted, state, self._speed_mps, VELOCITY_ERROR_GAIN)
+        north_mps, east_mps = add_velocity_error(wanted, state, self._command.speed_mps, VELOCITY_ERROR_GAIN)
         return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
 
     def _wanted(self, track: TrackedObject, towards_rad: float, dt_s: float) -> tuple[float, float]:
@@ -200,9 +167,10 @@ class FollowBehaviour(Behaviour):
         trust = min(1.0, SURE_OF_SPEED_MPS / max(track.speed_sigma_mps, 1e-6))
         if self._unseen_s > UNSEEN_S:
             # The longer the prediction, the less it is followed.
-            trust *= max(0.0, 1.0 - (self._unseen_s - UNSEEN_S) / max(self._occlusion_s, UNSEEN_S)) ** 0.5
+            hidden = (self._unseen_s - UNSEEN_S) / max(self._command.occlusion_s, UNSEEN_S)
+            trust *= max(0.0, 1.0 - hidden) ** 0.5
         north, east = (trust * speed for speed in track.velocity_ned_mps)
-        closing = GAIN_PER_S * (self._range_m - self._distance_m)
+        closing = GAIN_PER_S * (self._range_m - self._command.distance_m)
         closing = max(-MOST_CLOSING_MPS, min(MOST_CLOSING_MPS, closing))
         circling = 0.0
         goal_rad = self._goal_rad(track, dt_s)
@@ -216,10 +184,10 @@ class FollowBehaviour(Behaviour):
 
     def _goal_rad(self, track: TrackedObject, dt_s: float) -> float | None:
         """Goal bearing, seen from the object; None: anywhere on the circle."""
-        if self._bearing == "here":
+        if self._command.bearing == "here":
             return None
-        if self._bearing == "compass":
-            return wrap_angle(self._angle_rad)
+        if self._command.bearing == "compass":
+            return wrap_angle(math.radians(self._command.angle_deg))
         north, east = track.velocity_ned_mps
         if math.hypot(north, east) > COURSE_MPS:
             course = math.atan2(east, north)
@@ -228,10 +196,12 @@ class FollowBehaviour(Behaviour):
             most = COURSE_RATE_RADPS * dt_s
             turn = wrap_angle(course - self._course_rad)
             self._course_rad = wrap_angle(self._course_rad + max(-most, min(most, turn)))
-        return None if self._course_rad is None else wrap_angle(self._course_rad + self._angle_rad)
+        if self._course_rad is None:
+            return None
+        return wrap_angle(self._course_rad + math.radians(self._command.angle_deg))
 
     def _observe(self, context: BehaviourContext) -> None:
-        seen = context.objects.of(self.subject, self._confidence)
+        seen = context.objects.of(self.subject, self._command.confidence)
         if seen is not None:
             self._object = seen
         elif (target := context.objects.in_sight(self.subject)) is not None:

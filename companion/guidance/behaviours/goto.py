@@ -62,42 +62,18 @@ class Goto(Command):
             raise GrammarError(f"goto: give both {given[0]}; one is missing")
 
     def build(self, context: BuildContext) -> Behaviour:
-        return GotoBehaviour(
-            from_home_m=_pair(self.north_m, self.east_m),
-            from_here_m=_pair(self.forward_m, self.right_m),
-            global_deg=_pair(self.latitude_deg, self.longitude_deg),
-            altitude_m=self.altitude_m,
-            speed_mps=self.speed_mps,
-            heading_rad=None if self.heading_deg is None else math.radians(self.heading_deg),
-        )
+        return GotoBehaviour(self)
 
 
 class GotoBehaviour(PathFlight):
-    """Flies to a point given by exactly one pair.
-
-    Args:
-        from_home_m: (north, east) of home. from_here_m: (forward, right) of the position where it begins.
-        global_deg: (latitude, longitude), WGS 84. altitude_m: above home; None: unchanged.
-    """
+    """Flies to the point."""
 
     name = "goto"
 
-    def __init__(
-        self,
-        *,
-        from_home_m: tuple[float, float] | None = None,
-        from_here_m: tuple[float, float] | None = None,
-        global_deg: tuple[float, float] | None = None,
-        altitude_m: float | None = None,
-        speed_mps: float = 3.0,
-        heading_rad: float | None = None,
-    ) -> None:
-        super().__init__(speed_mps, heading_rad=heading_rad)
-        given = [pair for pair in (from_home_m, from_here_m, global_deg) if pair is not None]
-        if len(given) != 1:
-            raise ValueError("goto needs exactly one of from_home_m, from_here_m and global_deg")
-        self._from_home_m, self._from_here_m, self._global_deg = from_home_m, from_here_m, global_deg
-        self._altitude_m = altitude_m
+    def __init__(self, command: Goto) -> None:
+        heading_rad = None if command.heading_deg is None else math.radians(command.heading_deg)
+        super().__init__(command.speed_mps, heading_rad=heading_rad)
+        self._command = command
 
     def _path(self, context: BehaviourContext) -> Path:
         position, _ = position_and_yaw(context.state)
@@ -115,23 +91,20 @@ class GotoBehaviour(PathFlight):
             return ()  # reported when it begins
 
     def _goal(self, context: BehaviourContext) -> Vector3:
-        state = context.state
+        state, command = context.state, self._command
         position, yaw_rad = position_and_yaw(state)
-        down = position[2] if self._altitude_m is None else home_of(state)[2] - self._altitude_m
-        if self._from_home_m is not None:
+        down = position[2] if command.altitude_m is None else home_of(state)[2] - command.altitude_m
+        if command.north_m is not None and command.east_m is not None:
             home = home_of(state)
-            return (home[0] + self._from_home_m[0], home[1] + self._from_home_m[1], down)
-        if self._from_here_m is not None:
-            forward, right = self._from_here_m
-            north = forward * math.cos(yaw_rad) - right * math.sin(yaw_rad)
-            east = forward * math.sin(yaw_rad) + right * math.cos(yaw_rad)
+            return (home[0] + command.north_m, home[1] + command.east_m, down)
+        if command.forward_m is not None and command.right_m is not None:
+            north = command.forward_m * math.cos(yaw_rad) - command.right_m * math.sin(yaw_rad)
+            east = command.forward_m * math.sin(yaw_rad) + command.right_m * math.cos(yaw_rad)
             return (position[0] + north, position[1] + east, down)
-        assert self._global_deg is not None
-        return (*local_from_global(state, context.now_ns, self._global_deg), down)
+        assert command.latitude_deg is not None
+        assert command.longitude_deg is not None
+        place = (command.latitude_deg, command.longitude_deg)
+        return (*local_from_global(state, context.now_ns, place), down)
 
     def _success_text(self) -> str:
         return "goal reached"
-
-
-def _pair(first: float | None, second: float | None) -> tuple[float, float] | None:
-    return None if first is None or second is None else (first, second)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.seek import BlindTime, Facing, Standing, range_m, range_text
 from companion.guidance.command import (
@@ -96,54 +96,24 @@ class Patrol(Command):
         return names_in(self.class_names)
 
     def build(self, context: BuildContext) -> Behaviour:
-        return PatrolBehaviour(
-            self.points_m,
-            self.names,
-            speed_mps=self.speed_mps,
-            laps=self.laps,
-            approach_m=self.distance_m if self.on_detection == "approach" else None,
-            dwell_s=self.dwell_s,
-            revisit_s=self.revisit_s,
-            merge_radius_m=self.merge_radius_m,
-            confidence=self.confidence,
-        )
+        return PatrolBehaviour(self)
 
 
 class PatrolBehaviour(Behaviour):
-    """Flies the closed path; stops for an object that is found, turns to it and logs its position.
-
-    Args:
-        points: (north, east) or (north, east, height) metres from home; a closed path.
-        speed_mps: along the path. laps: 0: until another command.
-        approach_m: distance to which to approach a find; None: face it from the path.
-        dwell_s: time spent at an object.
-        revisit_s: an object does not stop the patrol again within this time.
-        merge_radius_m: an object within this distance of one that stopped it is the same.
-    """
+    """Flies the closed path; stops for an object that is found, turns to it and logs its position."""
 
     name = "patrol"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
 
-    def __init__(
-        self,
-        points: Sequence[tuple[float, ...]],
-        class_names: Collection[str],
-        *,
-        speed_mps: float = 3.0,
-        laps: float = 0.0,
-        approach_m: float | None = None,
-        dwell_s: float = 5.0,
-        revisit_s: float = 120.0,
-        merge_radius_m: float = 5.0,
-        confidence: float = 0.4,
-    ) -> None:
-        self.class_names = tuple(class_names)
-        if approach_m is not None:
+    def __init__(self, command: Patrol) -> None:
+        self._command = command
+        self.class_names = command.names
+        self._approaches = command.on_detection == "approach"
+        if self._approaches:
             self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
-        self._route = FollowPathBehaviour(points, speed_mps, laps=laps, round_trip=True)
-        self._speed_mps, self._confidence = speed_mps, confidence
-        self._approach_m, self._dwell_s = approach_m, dwell_s
-        self._revisit_s, self._merge_radius_m = revisit_s, merge_radius_m
+        self._route = FollowPathBehaviour(
+            command.points_m, command.speed_mps, laps=command.laps, round_trip=True
+        )
         self._begin(0)
 
     def _begin(self, now_ns: int) -> None:
@@ -203,7 +173,7 @@ class PatrolBehaviour(Behaviour):
 
     def _find(self, context: BehaviourContext) -> Facing | None:
         """The nearest find, if it has not been stopped for yet."""
-        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        seen = context.objects.seen(self.class_names, self._command.confidence, self._begun_ns)
         finds = [each for each in seen if each.certain and not self._knows(each)]
         if not finds:
             return None
@@ -225,22 +195,23 @@ class PatrolBehaviour(Behaviour):
             self._found += 1
             self._remember(facing.object, now_ns)
             self._note(f"found a {_named(facing.object)}, {_place_text(facing.object, context)}")
-            if self._approach_m is not None:
-                return self._go_there(facing.object, self._approach_m, context)
-            self._wait_until_ns = now_ns + self._dwell_s * 1e9
+            if self._approaches:
+                return self._go_there(facing.object, context)
+            self._wait_until_ns = now_ns + self._command.dwell_s * 1e9
         return self._stand(context, facing.bearing_rad)
 
-    def _go_there(
-        self, found: TrackedObject, distance_m: float, context: BehaviourContext
-    ) -> BehaviourOutput:
-        self._approach = ApproachBehaviour(
-            Subject(found.class_name),
-            distance_m=distance_m,
-            speed_mps=min(self._speed_mps, 3.0),
-            confidence=min(0.3, self._confidence),
+    def _go_there(self, found: TrackedObject, context: BehaviourContext) -> BehaviourOutput:
+        command, subject = self._command, Subject(found.class_name)
+        nearer = Approach(
+            subject,
+            distance_m=command.distance_m,
+            speed_mps=min(command.speed_mps, 3.0),
+            confidence=min(0.3, command.confidence),
+            retries=0.0,
         )
+        self._approach = ApproachBehaviour(nearer)
         self._approach.on_activate(context)
-        context.objects.choose(Subject(found.class_name), found)
+        context.objects.choose(subject, found)
         return self._fly_there(self._approach, 0.0, context)
 
     def _fly_there(
@@ -252,7 +223,7 @@ class PatrolBehaviour(Behaviour):
         approach.on_deactivate()
         self._approach = None
         self._note(step.reason)
-        self._standing, self._wait_until_ns = None, context.now_ns + self._dwell_s * 1e9
+        self._standing, self._wait_until_ns = None, context.now_ns + self._command.dwell_s * 1e9
         return self._stand(context)
 
     def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
@@ -272,7 +243,7 @@ class PatrolBehaviour(Behaviour):
 
     def _remember(self, seen: TrackedObject, now_ns: int) -> None:
         others = [known for known in self._known if not self._same(known.object, seen)]
-        self._known = [*others, _Known(seen, now_ns + self._revisit_s * 1e9)]
+        self._known = [*others, _Known(seen, now_ns + self._command.revisit_s * 1e9)]
 
     def _same(self, known: TrackedObject, seen: TrackedObject) -> bool:
         if known.object_id == seen.object_id:
@@ -280,7 +251,7 @@ class PatrolBehaviour(Behaviour):
         if known.position_ned_m is None or seen.position_ned_m is None:
             return False
         apart_m = math.dist(known.position_ned_m[:2], seen.position_ned_m[:2])
-        return known.class_name == seen.class_name and apart_m <= self._merge_radius_m
+        return known.class_name == seen.class_name and apart_m <= self._command.merge_radius_m
 
     def _note(self, text: str) -> None:
         self.add_notes(f"patrol: {text}")

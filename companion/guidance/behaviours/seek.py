@@ -113,30 +113,12 @@ class Seek(Command):
 
     def build(self, context: BuildContext) -> Behaviour:
         if self.pattern != "turn":
-            return SearchBehaviour(
-                self.class_name,
-                radius_m=self.radius_m,
-                size_m=None
-                if self.width_m is None or self.height_m is None
-                else (self.width_m, self.height_m),
-                spacing_m=self.spacing_m,
-                footprint=context.footprint,
-                speed_mps=self.speed_mps,
-                confidence=self.confidence,
-            )
+            return SearchBehaviour(self, context.footprint)
         sweep = None
         if self.sweep_deg is not None:
             sweep_rad, rate_radps = math.radians(self.sweep_deg), math.radians(self.sweep_rate_dps)
             sweep = GimbalSweep(sweep_rad, rate_radps, field_of_view_rad(context.footprint))
-        return SeekBehaviour(
-            self.class_name,
-            laps=self.laps,
-            rate_radps=self.rate_radps,
-            confidence=self.confidence,
-            clockwise=self.direction == "clockwise",
-            whole_turn=True,
-            sweep=sweep,
-        )
+        return SeekBehaviour(self, whole_turn=True, sweep=sweep)
 
 
 class Facing:
@@ -243,33 +225,21 @@ class SeekBehaviour(Behaviour):
     name = "seek"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
 
-    def __init__(
-        self,
-        class_name: str,
-        *,
-        laps: float = 2.0,
-        rate_radps: float = 0.5,
-        confidence: float = 0.4,
-        clockwise: bool = True,
-        whole_turn: bool = False,
-        sweep: GimbalSweep | None = None,
-    ) -> None:
-        self._sweep = sweep
+    def __init__(self, command: Seek, *, whole_turn: bool = False, sweep: GimbalSweep | None = None) -> None:
+        self._command, self._sweep, self._rate_radps = command, sweep, command.rate_radps
         if sweep is not None:
             self.requirements = SeekBehaviour.requirements | {Requirement.GIMBAL}
             self.gimbal_pitches_rad = (0.0, sweep.end_rad)
-            rate_radps = min(rate_radps, sweep.turn_rate_radps)
-        self.class_names = (class_name,)
-        self._class_name, self._confidence = class_name, confidence
-        self._laps, self._rate_radps, self._turn = laps, rate_radps, 1.0 if clockwise else -1.0
-        self._compare_at_rad = min(laps, 1.0) * math.tau if whole_turn else 0.0
+            self._rate_radps = min(command.rate_radps, sweep.turn_rate_radps)
+        self.class_names = (command.class_name,)
+        self._turn = 1.0 if command.direction == "clockwise" else -1.0
+        self._compare_at_rad = min(command.laps, 1.0) * math.tau if whole_turn else 0.0
         self._begin(0, (0.0, 0.0, 0.0), 0.0)
 
     def _begin(self, now_ns: int, point: Vector3, yaw_rad: float) -> None:
         self._begun_ns, self._point, self._yaw_rad = now_ns, point, yaw_rad
-        limit_s = (
-            SLOWEST_TURN * self._laps * math.tau / self._rate_radps + MOST_FALSE_FINDS * FACING_TIMEOUT_S
-        )
+        turn_s = self._command.laps * math.tau / self._rate_radps
+        limit_s = SLOWEST_TURN * turn_s + MOST_FALSE_FINDS * FACING_TIMEOUT_S
         self._give_up_ns = now_ns + limit_s * 1e9
         self._turned_rad = 0.0
         self._compared = self._doubted = False
@@ -309,9 +279,9 @@ class SeekBehaviour(Behaviour):
             self._facing = Facing(best, now_ns)
         if self._facing is not None:
             return self._face(self._facing, dt_s, context) or wait
-        if abs(self._turned_rad) >= self._laps * math.tau:
+        if abs(self._turned_rad) >= self._command.laps * math.tau:
             why = f": {DOUBTED}" if self._doubted else ""
-            self._failure = f"no {self._class_name} found in {laps_text(self._laps)}{why}"
+            self._failure = f"no {self._command.class_name} found in {laps_text(self._command.laps)}{why}"
             self._return_until_ns = now_ns + BACK_TIMEOUT_S * 1e9
             return self._look_back(dt_s, context) or wait
         if now_ns < self._look_until_ns:
@@ -324,7 +294,7 @@ class SeekBehaviour(Behaviour):
 
     def _note(self, context: BehaviourContext) -> None:
         """Note what the newest frame shows, and pause the turn at a first sight."""
-        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        seen = context.objects.seen(self.class_names, self._command.confidence, self._begun_ns)
         certain = [each for each in seen if each.certain]
         # Two of them may turn out to be one.
         finds = (*self._finds.values(), *certain)
@@ -370,10 +340,11 @@ class SeekBehaviour(Behaviour):
 
     @property
     def status(self) -> str:
+        name, laps = self._command.class_name, max(0.0, self._turned_rad) / math.tau
         if self._facing is not None:
-            return f"facing the {self._class_name} at {in_degrees(self._facing.bearing_rad)}°"
+            return f"facing the {name} at {in_degrees(self._facing.bearing_rad)}°"
         seen = f", {len(self._finds)} found" if self._finds else ""
-        return f"searching for a {self._class_name}, {max(0.0, self._turned_rad) / math.tau:.1f} laps{seen}"
+        return f"searching for a {name}, {laps:.1f} laps{seen}"
 
     def _hindered(self, sweep: GimbalSweep, context: BehaviourContext) -> str | None:
         """Why the gimbal does not follow, in words; None: it does."""
@@ -401,32 +372,16 @@ class SearchBehaviour(PathFlight):
     """Flies an expanding square or a lawnmower pattern about its start, nose along the path.
 
     Args:
-        radius_m: half a side of the expanding square. size_m: (west to east, south to north) of the
-            lawnmower's area. Exactly one of them.
-        spacing_m: between strips; None: from `footprint` at the current height.
+        footprint: of the camera, for the spacing of strips at the current height; None: not known.
     """
 
     name = "seek"
     requirements = SeekBehaviour.requirements
 
-    def __init__(
-        self,
-        class_name: str,
-        *,
-        radius_m: float | None = None,
-        size_m: tuple[float, float] | None = None,
-        spacing_m: float | None = None,
-        footprint: Footprint | None = None,
-        speed_mps: float = 2.0,
-        confidence: float = 0.4,
-    ) -> None:
-        super().__init__(speed_mps)
-        if (radius_m is None) == (size_m is None):
-            raise ValueError("a search needs exactly one of radius_m and size_m")
-        self.class_names = (class_name,)
-        self._class_name, self._confidence = class_name, confidence
-        self._radius_m, self._size_m = radius_m, size_m
-        self._spacing_m, self._footprint = spacing_m, footprint
+    def __init__(self, command: Seek, footprint: Footprint | None = None) -> None:
+        super().__init__(command.speed_mps)
+        self.class_names = (command.class_name,)
+        self._command, self._footprint = command, footprint
         self._begin(0)
 
     def _begin(self, now_ns: int) -> None:
@@ -444,7 +399,7 @@ class SearchBehaviour(PathFlight):
             return blind
         if not context.perception_fresh:
             return self._stand(context)
-        seen = context.objects.seen(self.class_names, self._confidence, self._begun_ns)
+        seen = context.objects.seen(self.class_names, self._command.confidence, self._begun_ns)
         self._doubted |= any(each.frames >= FOUND_FRAMES and not each.certain for each in seen)
         if self._facing is None and (found := [each for each in seen if each.certain]):
             self._facing = Facing(found[0], context.now_ns)
@@ -461,14 +416,14 @@ class SearchBehaviour(PathFlight):
         step = super().update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             why = f": {DOUBTED}" if self._doubted else ""
-            return Outcome(False, f"no {self._class_name} found in the area{why}")
+            return Outcome(False, f"no {self._command.class_name} found in the area{why}")
         return step
 
     @property
     def status(self) -> str:
         if self._facing is not None:
-            return f"facing the {self._class_name}"
-        return f"searching an area for a {self._class_name}{super().status.removeprefix(self.name)}"
+            return f"facing the {self._command.class_name}"
+        return f"searching an area for a {self._command.class_name}{super().status.removeprefix(self.name)}"
 
     def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
         self._standing = self._standing or Standing(context)
@@ -476,18 +431,19 @@ class SearchBehaviour(PathFlight):
 
     def _path(self, context: BehaviourContext) -> Path:
         position, _ = position_and_yaw(context.state)
-        spacing_m = self._spacing_m
+        command, spacing_m = self._command, self._command.spacing_m
         if spacing_m is None:
             if self._footprint is None:
                 raise ValueError("camera footprint unknown: set spacing")
             spacing_m = self._footprint.spacing_m(context.state.altitude_m or 0.0)
-        if self._radius_m is not None:
-            points = expanding_square(self._radius_m, spacing_m)
+        if command.radius_m is not None:
+            points = expanding_square(command.radius_m, spacing_m)
         else:
-            assert self._size_m is not None
-            points = lawnmower(*self._size_m, spacing_m)
+            assert command.width_m is not None
+            assert command.height_m is not None
+            points = lawnmower(command.width_m, command.height_m, spacing_m)
         path = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
-        if self._radius_m is not None and len(points) == 1:
+        if command.radius_m is not None and len(points) == 1:
             raise ValueError(f"one strip of {spacing_m:.0f} m covers the area: use pattern=turn")
         return Path([position, *path], self._speed_mps)
 

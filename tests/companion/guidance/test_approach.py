@@ -3,7 +3,7 @@ import random
 
 import pytest
 
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.objects.target import RangeSource
 from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
@@ -19,7 +19,7 @@ def test_approach_stops_at_the_distance_without_overshoot(north: float, east: fl
     car = SeenObject("car", north, east)
     vehicle = KinematicVehicle()
     nearest = []
-    flight = Flight(ApproachBehaviour(Subject("car"), distance_m=5.0), vehicle, [car])
+    flight = Flight(ApproachBehaviour(Approach(Subject("car"), distance_m=5.0, retries=0.0)), vehicle, [car])
     outcome = assert_succeeded(flight.run(120.0, lambda seconds, v: nearest.append(distance_to(v, car))))
     assert outcome.reason.startswith("reached car")
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.35)
@@ -32,7 +32,12 @@ def test_approach_arrives_with_noisy_ranges() -> None:
     noise = random.Random(7)
     car = SeenObject("car", 25.0, -6.0)
     vehicle = KinematicVehicle()
-    flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=lambda: noise.gauss(0.0, 0.06))
+    flight = Flight(
+        ApproachBehaviour(Approach(Subject("car"), retries=0.0)),
+        vehicle,
+        [car],
+        noise=lambda: noise.gauss(0.0, 0.06),
+    )
     assert_succeeded(flight.run(120.0))
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.8)
 
@@ -41,7 +46,9 @@ def test_approach_retreats_when_it_starts_too_near() -> None:
     person = SeenObject("person", 2.0, 0.0)
     vehicle = KinematicVehicle()
     assert_succeeded(
-        Flight(ApproachBehaviour(Subject("person"), distance_m=4.0), vehicle, [person]).run(60.0)
+        Flight(
+            ApproachBehaviour(Approach(Subject("person"), distance_m=4.0, retries=0.0)), vehicle, [person]
+        ).run(60.0)
     )
     assert distance_to(vehicle, person) == pytest.approx(4.0, abs=0.35)
 
@@ -53,7 +60,11 @@ def test_approach_keeps_its_object_when_a_nearer_appears() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         second.visible = seconds > 2.0
 
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [first, second]).run(90.0, each))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [first, second]).run(
+            90.0, each
+        )
+    )
     assert distance_to(vehicle, first) == pytest.approx(5.0, abs=0.35)
 
 
@@ -65,7 +76,9 @@ def test_approach_follows_a_walking_object() -> None:
             person.east = 0.8 * seconds
 
     vehicle = KinematicVehicle()
-    assert_succeeded(Flight(ApproachBehaviour(Subject("person")), vehicle, [person]).run(90.0, each))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("person"), retries=0.0)), vehicle, [person]).run(90.0, each)
+    )
     assert distance_to(vehicle, person) == pytest.approx(5.0, abs=0.5)
 
 
@@ -79,7 +92,9 @@ def test_approach_brakes_and_ends_when_target_lost() -> None:
         if seconds > 9.0:
             stopped_at.append(vehicle.position[0])
 
-    outcome = Flight(ApproachBehaviour(Subject("car"), lost_timeout_s=6.0), vehicle, [car]).run(60.0, each)
+    outcome = Flight(
+        ApproachBehaviour(Approach(Subject("car"), lost_timeout_s=6.0, retries=0.0)), vehicle, [car]
+    ).run(60.0, each)
     assert_failed(outcome, "lost the ", "car ")
     assert max(stopped_at) - min(stopped_at) < 0.2
 
@@ -91,11 +106,15 @@ def test_approach_continues_when_object_reappears() -> None:
         car.visible = not 4.0 < seconds < 7.0
 
     vehicle = KinematicVehicle()
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(90.0, each))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [car]).run(90.0, each)
+    )
 
 
 def test_silent_detector_brakes_and_ends_approach() -> None:
-    flight = Flight(ApproachBehaviour(Subject("car")), objects=[SeenObject("car", 40.0, 0.0)])
+    flight = Flight(
+        ApproachBehaviour(Approach(Subject("car"), retries=0.0)), objects=[SeenObject("car", 40.0, 0.0)]
+    )
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 4.0
@@ -107,7 +126,9 @@ def test_silent_detector_brakes_and_ends_approach() -> None:
 def test_approach_without_range_only_yaws() -> None:
     car = SeenObject("car", 20.0, 12.0, with_range=False)
     vehicle = KinematicVehicle()
-    assert_failed(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0), "range")
+    assert_failed(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [car]).run(60.0), "range"
+    )
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.1
     assert vehicle.yaw_rad == pytest.approx(math.atan2(12.0, 20.0), abs=0.05)
 
@@ -119,7 +140,9 @@ def test_approach_finishes_on_bearings_when_range_is_lost() -> None:
         car.with_range = distance_to(vehicle, car) > 7.0
 
     vehicle = KinematicVehicle()
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car]).run(60.0, each))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [car]).run(60.0, each)
+    )
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.5)
 
 
@@ -132,6 +155,6 @@ def test_wrong_first_range_does_not_lose_the_object(source: RangeSource) -> None
         return wrong.pop() if wrong else 0.0
 
     vehicle = KinematicVehicle()
-    flight = Flight(ApproachBehaviour(Subject("car")), vehicle, [car], noise=noise)
+    flight = Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [car], noise=noise)
     assert_succeeded(flight.run(60.0))
     assert distance_to(vehicle, car) == pytest.approx(5.0, abs=0.4)

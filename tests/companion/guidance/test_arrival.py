@@ -18,9 +18,9 @@ from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
@@ -107,8 +107,8 @@ def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
-    goto = GotoBehaviour(from_home_m=goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
-    height_m = goto._altitude_m
+    goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
+    height_m = goto._command.altitude_m
     assert height_m is not None
     home = flight.state.home_position_ned_m
     assert home is not None
@@ -123,7 +123,7 @@ def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
 def test_hold_stays_within_0_3_m_in_gusts(seed: int) -> None:
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
-    goto = GotoBehaviour(from_home_m=goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
+    goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
     outcome, hold = then_hold(LockstepFlight.airborne(**air("px4", seed)), goto)
     assert outcome.goal_ned_m is not None
     assert max(math.dist(m.context.state.position_ned_m or (), outcome.goal_ned_m) for m in hold) <= 0.3
@@ -152,7 +152,9 @@ def test_approach_fixes_its_goal_on_arrival(name: str, seed: int) -> None:
     seeing = SyntheticCamera(camera_settings(camera, mount), detect=detector, rate_hz=5.0)
     flight = LockstepFlight.airborne(height_m=2.5, camera=lambda _: seeing, **air(name, seed))
     flight.turn_to(math.atan2(3.0, 15.0))
-    outcome, hold = then_hold(flight, ApproachBehaviour(Subject("car"), distance_m=5.0))
+    outcome, hold = then_hold(
+        flight, ApproachBehaviour(Approach(Subject("car"), distance_m=5.0, retries=0.0))
+    )
     assert outcome.goal_ned_m is not None
     assert_arrived(outcome, hold, outcome.goal_ned_m, name)
     assert car.range_m(outcome.goal_ned_m, 0.0) == pytest.approx(5.0, abs=0.5)

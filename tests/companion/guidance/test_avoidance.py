@@ -9,10 +9,10 @@ from itertools import pairwise
 
 import pytest
 
-from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.patrol import PatrolBehaviour
+from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput
 from companion.guidance.limits.obstacles import ObstacleRules
@@ -58,7 +58,7 @@ def around(side_m: float, free_m: float = 100.0) -> Plan:
 
 def flown(harness: GuidanceHarness, seconds: float) -> list[tuple[float, ...]]:
     harness.run(0.1)
-    harness.command(GotoBehaviour(from_here_m=(12.0, 0.0), speed_mps=2.0))
+    harness.command(GotoBehaviour(Goto(forward_m=12.0, right_m=0.0, speed_mps=2.0)))
     track = []
     for _ in range(round(seconds / STEP_S)):
         harness.run()
@@ -81,7 +81,7 @@ def test_goto_flies_the_planned_path() -> None:
 def test_patrol_flies_the_planned_path() -> None:
     harness = harness_with(around(3.0))
     harness.run(0.1)
-    harness.command(PatrolBehaviour(((0.0, 0.0), (12.0, 0.0)), ["car"]))
+    harness.command(PatrolBehaviour(Patrol("0,0 12,0", "car")))
     harness.until(lambda: harness.vehicle.position[1] > 2.0, 10.0)
 
 
@@ -130,7 +130,7 @@ def test_approach_flies_the_planned_path_to_a_hidden_object() -> None:
 
     harness = harness_with(seen, objects=[car])
     harness.run(0.1)
-    pending = harness.command(ApproachBehaviour(Subject("car"), distance_m=5.0))
+    pending = harness.command(ApproachBehaviour(Approach(Subject("car"), distance_m=5.0, retries=0.0)))
     aside: list[float] = []
     while not pending.done() and len(aside) < 1000:
         harness.run()

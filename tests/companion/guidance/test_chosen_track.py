@@ -117,7 +117,7 @@ def test_unknown_track_is_refused_with_what_is_there() -> None:
     objects = [car(12, 0, 3), car(15, 2, 4), SeenObject("person", 10, -2, track_id=5, track_score=0.8)]
     harness = watching(flying(), objects)
     harness.run(0.5)
-    reason = refused(harness, FollowBehaviour(Subject(track_id=17)))
+    reason = refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
     assert "no track 17" in reason
     assert "2 car, 1 person" in reason
     assert harness.events[-1].kind is EventKind.REFUSED
@@ -142,7 +142,7 @@ def test_ended_track_without_a_successor_is_refused_with_a_list() -> None:
     harness.run(0.5)
     objects[0] = SeenObject("person", 10, 0, track_id=18, track_score=0.8)
     harness.run(5.0)
-    reason = refused(harness, FollowBehaviour(Subject(track_id=17)))
+    reason = refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
     assert "track 17 ended 3 s ago" in reason
     assert "present: 1 person" in reason
 
@@ -153,7 +153,7 @@ def test_track_that_is_missed_for_a_moment_is_accepted() -> None:
     harness.run(0.5)
     seen.visible = False
     harness.run(1.5)
-    engaged(harness, FollowBehaviour(Subject(track_id=17)))
+    engaged(harness, FollowBehaviour(Follow(Subject(track_id=17))))
     assert harness.guidance.busy
 
 
@@ -165,7 +165,7 @@ def test_track_whose_object_has_another_id_now_is_accepted() -> None:
     harness.run(0.5)
     seen.visible, seen.track_id = True, 23
     harness.run(3.0)
-    engaged(harness, FollowBehaviour(Subject(track_id=17)))
+    engaged(harness, FollowBehaviour(Follow(Subject(track_id=17))))
     (note,) = [event.message for event in harness.events if event.kind is EventKind.NOTED]
     assert note == "track 17: the object is track 23 now"
     assert "track 23 (was 17)" in harness.guidance.status
@@ -175,7 +175,7 @@ def test_range_of_the_class_of_a_track_is_required() -> None:
     means = RangeMeans(depth=False, ground=False, classes=frozenset({"person"}))
     harness = watching(flying(), [car(12, 0, 17)], ranging=means)
     harness.run(0.5)
-    assert "a range to a car" in refused(harness, FollowBehaviour(Subject(track_id=17)))
+    assert "a range to a car" in refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
 
 
 # --- flights
@@ -188,14 +188,16 @@ def test_follow_keeps_to_the_farther_car() -> None:
     def each(seconds: float, _vehicle: KinematicVehicle) -> None:
         near.north, far.north = 12 + 1.0 * seconds, 20 + 1.0 * seconds
 
-    assert Flight(FollowBehaviour(Subject(track_id=2)), vehicle, [near, far]).run(20.0, each) is None
+    assert Flight(FollowBehaviour(Follow(Subject(track_id=2))), vehicle, [near, far]).run(20.0, each) is None
     assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(8.0, abs=0.8)
 
 
 def test_approach_flies_to_the_farther_car() -> None:
     near, far = car(15, 0, 1), car(25, 8, 2)
     vehicle = KinematicVehicle()
-    outcome = assert_succeeded(Flight(ApproachBehaviour(Subject(track_id=2)), vehicle, [near, far]).run(60.0))
+    outcome = assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject(track_id=2))), vehicle, [near, far]).run(60.0)
+    )
     assert outcome.reason.startswith("reached track 2 at")
     assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(5.0, abs=0.4)
 
@@ -213,7 +215,10 @@ def test_orbit_is_about_the_track() -> None:
 
 @pytest.mark.parametrize(
     "behaviour",
-    [FollowBehaviour(Subject(track_id=1)), ApproachBehaviour(Subject(track_id=1), distance_m=2.0)],
+    [
+        FollowBehaviour(Follow(Subject(track_id=1))),
+        ApproachBehaviour(Approach(Subject(track_id=1), distance_m=2.0)),
+    ],
 )
 def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
     behaviour: FollowBehaviour | ApproachBehaviour,
@@ -237,7 +242,10 @@ def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
 
 @pytest.mark.parametrize(
     "behaviour",
-    [FollowBehaviour(Subject(track_id=1)), ApproachBehaviour(Subject(track_id=1), distance_m=2.0)],
+    [
+        FollowBehaviour(Follow(Subject(track_id=1))),
+        ApproachBehaviour(Approach(Subject(track_id=1), distance_m=2.0)),
+    ],
 )
 def test_object_seen_beside_the_track_never_takes_its_place(
     behaviour: FollowBehaviour | ApproachBehaviour,
@@ -258,7 +266,7 @@ def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
     seen = car(12, 0, 17)
     harness = watching(flying(), [seen])
     harness.run(0.5)
-    command = harness.command(FollowBehaviour(Subject(track_id=17)), endless=True)
+    command = harness.command(FollowBehaviour(Follow(Subject(track_id=17))), endless=True)
     assert harness.outcome(command).success
     harness.run(2.0)
     seen.track_id, seen.east = 23, 4.8
@@ -277,7 +285,7 @@ def test_track_that_comes_back_with_its_id_is_followed_on() -> None:
     def each(seconds: float, _vehicle: KinematicVehicle) -> None:
         seen.north, seen.visible = 12 + 2.0 * seconds, not 8.0 <= seconds < 9.5
 
-    assert Flight(FollowBehaviour(Subject(track_id=1)), vehicle, [seen]).run(25.0, each) is None
+    assert Flight(FollowBehaviour(Follow(Subject(track_id=1))), vehicle, [seen]).run(25.0, each) is None
     assert math.dist(vehicle.position[:2], (seen.north, 0)) == pytest.approx(8.0, abs=0.8)
 
 
@@ -287,14 +295,16 @@ def test_lost_track_far_from_all_others_names_none() -> None:
     def each(seconds: float, _vehicle: KinematicVehicle) -> None:
         seen.visible = seconds < 5.0
 
-    outcome = Flight(FollowBehaviour(Subject(track_id=1)), objects=[seen, other]).run(30.0, each)
+    outcome = Flight(FollowBehaviour(Follow(Subject(track_id=1))), objects=[seen, other]).run(30.0, each)
     assert outcome is not None
     assert "track 2" not in outcome.reason
 
 
 def test_unconfirmed_track_is_not_flown_to() -> None:
     ghost = car(15, 0, 1, trusted=False)
-    assert_failed(Flight(ApproachBehaviour(Subject(track_id=1)), objects=[ghost]).run(20.0), "not confirmed")
+    assert_failed(
+        Flight(ApproachBehaviour(Approach(Subject(track_id=1))), objects=[ghost]).run(20.0), "not confirmed"
+    )
 
 
 def test_wanted_is_a_class_a_track_or_a_marker() -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from benchmarks.flights import UnknownFlightError, flight_named, flights, summary
 from benchmarks.flights_follow import run
-from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance.behaviours.follow import Follow, FollowBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.objects.tracked_object import Subject
@@ -27,14 +27,14 @@ def moving(
 def test_follow_keeps_its_distance_through_an_occlusion(bearing: str) -> None:
     car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
     vehicle = KinematicVehicle()
-    flight = Flight(FollowBehaviour(Subject("car"), distance_m=8.0, bearing=bearing), vehicle, [car])
+    flight = Flight(FollowBehaviour(Follow(Subject("car"), distance_m=8.0, bearing=bearing)), vehicle, [car])
     assert flight.run(30.0, moving(car, 3.0, hidden=(18.0, 19.5))) is None
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(8.0, abs=0.8)
 
 
 def test_follow_ends_when_target_lost() -> None:
     car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
-    outcome = Flight(FollowBehaviour(Subject("car"), occlusion_s=2.0), objects=[car]).run(
+    outcome = Flight(FollowBehaviour(Follow(Subject("car"), occlusion_s=2.0)), objects=[car]).run(
         30.0, moving(car, 3.0, hidden=(10, 99))
     )
     assert_failed(outcome, "lost the ", "car ")
@@ -43,7 +43,7 @@ def test_follow_ends_when_target_lost() -> None:
 def test_follow_does_not_switch_to_another_object() -> None:
     car = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.8)
     other = SeenObject("car", 20.0, 4.0, track_id=2, track_score=0.9)
-    outcome = Flight(FollowBehaviour(Subject("car")), objects=[car, other]).run(
+    outcome = Flight(FollowBehaviour(Follow(Subject("car"))), objects=[car, other]).run(
         30.0, moving(car, 0.5, hidden=(6, 99))
     )
     assert_failed(outcome, "lost the ", "car ")

@@ -13,7 +13,7 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.formation import FormationBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits
@@ -169,7 +169,7 @@ def test_leaving_by_command_frees_the_slot_at_once() -> None:
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 30.0)
     leaving = next(name for name, slot in slots(fleet, "b").items() if slot == 1)
     rest = [name for name in "bcd" if name != leaving]
-    assert fleet.command(leaving, GotoBehaviour(from_home_m=(-20.0, 30.0))) is None
+    assert fleet.command(leaving, GotoBehaviour(Goto(north_m=-20.0, east_m=30.0))) is None
     assert fleet.run_until(lambda: fleet.members[leaving].outcome is not None and settled(fleet, rest), 40.0)
     assert separated(fleet)
 

@@ -15,7 +15,7 @@ from companion.guidance.behaviour import (
     Outcome,
     Requirement,
 )
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
@@ -181,6 +181,8 @@ def test_approach_retreats_from_an_approaching_object(speed_mps: float, nearest_
         car.north = 20.0 - speed_mps * seconds
         ranges.append(math.hypot(car.north - active.position[0], car.east - active.position[1]))
 
-    Flight(ApproachBehaviour(Subject("car"), distance_m=5.0), vehicle, [car]).run(25.0, each)
+    Flight(ApproachBehaviour(Approach(Subject("car"), distance_m=5.0, retries=0.0)), vehicle, [car]).run(
+        25.0, each
+    )
     assert min(ranges) > nearest_m
     assert min(ranges[-100:]) > 4.6

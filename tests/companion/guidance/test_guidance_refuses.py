@@ -8,11 +8,11 @@ from companion.geometry.fence import Fence
 from companion.guidance.behaviour import Behaviour, BehaviourContext, ModeRequest, Outcome, Requirement
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
-from companion.guidance.behaviours.patrol import PatrolBehaviour
-from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind
@@ -58,7 +58,7 @@ def test_refused_offboard_ends_command_and_stream() -> None:
     [
         (parked, HoldBehaviour, ["hold needs", "in the air", "disarmed, on ground"]),
         (flying, TakeoffBehaviour, ["takeoff needs", "on the ground", "armed, in air"]),
-        (flying, lambda: SeekBehaviour("zebra"), ["seek needs", "zebra"]),
+        (flying, lambda: SeekBehaviour(Seek("zebra")), ["seek needs", "zebra"]),
     ],
 )
 def test_refused_command_names_what_is_missing(
@@ -79,7 +79,7 @@ def test_seek_is_refused_without_fresh_perception(age_s: float | None) -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = age_s
     harness.run(0.1)
-    reason = harness.outcome(harness.command(SeekBehaviour("car")), 5.0).reason
+    reason = harness.outcome(harness.command(SeekBehaviour(Seek("car"))), 5.0).reason
     assert "perception" in reason
     assert ("2.0 s old" if age_s else "no detections") in reason
 
@@ -88,7 +88,7 @@ def test_seek_waits_for_the_first_detections() -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = None
     harness.run(0.1)
-    future = harness.command(SeekBehaviour("car"))
+    future = harness.command(SeekBehaviour(Seek("car")))
     harness.run(3.0)
     assert not future.done()
     assert not harness.guidance.in_command
@@ -101,7 +101,7 @@ def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
     harness = GuidanceHarness(flying())
     harness.perception_age_s = 0.8
     harness.run(0.1)
-    future = harness.command(SeekBehaviour("car"))
+    future = harness.command(SeekBehaviour(Seek("car")))
     harness.run(0.5)
     assert not future.done()
     assert harness.guidance.phase == "offboard"
@@ -112,18 +112,12 @@ def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
 @pytest.mark.parametrize(
     ("behaviour", "where"),
     [
-        (GotoBehaviour(from_home_m=(30.0, 5000.0)), "5000.0 m east"),
+        (GotoBehaviour(Goto(north_m=30.0, east_m=5000.0)), "5000.0 m east"),
         (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "-7000.0 m east"),
-        (PatrolBehaviour([(0.0, 0.0), (9000.0, 0.0)], ("car",)), "9000.0 m north"),
+        (PatrolBehaviour(Patrol("0,0 4000,0", "car")), "4000.0 m north"),
         (FigureEightBehaviour(6000.0, 3.0, 1.0), "guidance.max_distance_m"),
-        (
-            GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=90.0),
-            "guidance.max_altitude_m = 50",
-        ),
-        (
-            GotoBehaviour(from_home_m=(0.0, 0.0), altitude_m=0.2),
-            "guidance.min_altitude_m = 1",
-        ),
+        (GotoBehaviour(Goto(north_m=0.0, east_m=0.0, altitude_m=90.0)), "guidance.max_altitude_m = 50"),
+        (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 0.2)], 3.0), "guidance.min_altitude_m = 1"),
         (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 60.0)], 3.0), "60.0 m above"),
     ],
 )
@@ -150,17 +144,17 @@ def test_level_flight_above_max_altitude_is_allowed() -> None:
     vehicle.position[2] = -60.0
     harness = GuidanceHarness(vehicle)
     harness.run(0.1)
-    assert not harness.command(GotoBehaviour(from_home_m=(5.0, 0.0))).done()
+    assert not harness.command(GotoBehaviour(Goto(north_m=5.0, east_m=0.0))).done()
 
 
 def test_goal_outside_the_fence_is_refused() -> None:
     fence = Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)))
     harness = GuidanceHarness(flying(), options=GuidanceOptions(Limits(fence=fence)))
     harness.run(0.1)
-    outcome = harness.command(GotoBehaviour(from_home_m=(30.0, 0.0))).result()
+    outcome = harness.command(GotoBehaviour(Goto(north_m=30.0, east_m=0.0))).result()
     assert "30.0 m north" in outcome.reason
     assert "fence_include" in outcome.reason
-    assert not harness.command(GotoBehaviour(from_home_m=(10.0, 0.0))).done()
+    assert not harness.command(GotoBehaviour(Goto(north_m=10.0, east_m=0.0))).done()
 
 
 def test_refused_command_keeps_the_current_behaviour() -> None:

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.objects.target import DOUBTED, RangeSource, Target
 from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
@@ -62,7 +62,7 @@ def test_track_id_at_an_impossible_position_is_another_object() -> None:
 
 def test_approach_ignores_unconfirmed_targets() -> None:
     ghost = SeenObject("car", 12.0, 0.0, track_id=1, track_score=0.6, trusted=False)
-    outcome = Flight(ApproachBehaviour(Subject("car")), objects=[ghost]).run(20.0)
+    outcome = Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), objects=[ghost]).run(20.0)
     assert outcome is not None
     assert_failed(outcome, "did not find ", "car ")
     assert outcome.reason.endswith(DOUBTED)
@@ -72,7 +72,9 @@ def test_approach_prefers_a_confirmed_target() -> None:
     ghost = SeenObject("car", 15.0, 0.0, track_id=1, track_score=0.6, trusted=False)
     car = SeenObject("car", 15.0, 6.0, track_id=2, track_score=0.6)
     vehicle = KinematicVehicle()
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [ghost, car]).run(60.0))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [ghost, car]).run(60.0)
+    )
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.4)
 
 
@@ -86,23 +88,35 @@ def test_approach_is_not_diverted_by_a_passing_object() -> None:
         other.north = 28.0
         car.visible = not abs(other.east) < 1.2  # hidden while the other passes
 
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car")), vehicle, [car, other]).run(90.0, each))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), retries=0.0)), vehicle, [car, other]).run(
+            90.0, each
+        )
+    )
     assert math.dist(vehicle.position[:2], (car.north, car.east)) == pytest.approx(5.0, abs=0.5)
 
 
 def test_tracked_object_may_have_low_confidence() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.12, track_id=2, track_score=0.7)
-    assert_succeeded(Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(60.0))
+    assert_succeeded(
+        Flight(ApproachBehaviour(Approach(Subject("car"), confidence=0.3, retries=0.0)), objects=[car]).run(
+            60.0
+        )
+    )
 
 
 def test_one_good_frame_does_not_start_an_approach() -> None:
     car = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=2, track_score=0.2)
-    assert_failed(Flight(ApproachBehaviour(Subject("car"), confidence=0.3), objects=[car]).run(20.0))
+    assert_failed(
+        Flight(ApproachBehaviour(Approach(Subject("car"), confidence=0.3, retries=0.0)), objects=[car]).run(
+            20.0
+        )
+    )
 
 
 def test_seek_ignores_unconfirmed_targets() -> None:
     ghost = SeenObject("car", 12.0, 4.0, track_id=1, track_score=0.6, trusted=False)
-    outcome = assert_failed(Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0))
+    outcome = assert_failed(Flight(SeekBehaviour(Seek("car", laps=1.0)), objects=[ghost]).run(60.0))
     assert outcome.reason.endswith(DOUBTED)
 
 
@@ -112,7 +126,7 @@ def test_seek_ends_once_the_target_is_confirmed() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         car.trusted = seconds > 1.5
 
-    assert_succeeded(Flight(SeekBehaviour("car", laps=1.0), objects=[car]).run(60.0, each))
+    assert_succeeded(Flight(SeekBehaviour(Seek("car", laps=1.0)), objects=[car]).run(60.0, each))
 
 
 def test_seek_faces_its_find_and_not_the_neighbour() -> None:
@@ -123,7 +137,7 @@ def test_seek_faces_its_find_and_not_the_neighbour() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         neighbour.visible = seconds > 0.6
 
-    Flight(SeekBehaviour("car"), vehicle, [car, neighbour]).run(60.0, each)
+    Flight(SeekBehaviour(Seek("car")), vehicle, [car, neighbour]).run(60.0, each)
     assert abs(vehicle.yaw_rad) < math.radians(4.5)
 
 

@@ -11,7 +11,7 @@ from benchmarks import flights_obstacles
 from benchmarks.flights_obstacles import ALLOWED_M, MARGIN_M
 from companion.bus.messages import obstacles_message
 from companion.guidance.behaviour import BehaviourContext
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput
@@ -159,7 +159,7 @@ def test_sending_needs_obstacle_sectors() -> None:
 
 
 def test_missing_required_depth_is_refused() -> None:
-    goto = GotoBehaviour(from_here_m=(5.0, 0.0))
+    goto = GotoBehaviour(Goto(forward_m=5.0, right_m=0.0))
     rules = ObstacleRules("required")
     why = check_requirements(goto, context(None), None, obstacles=rules)
     assert why is not None
@@ -178,7 +178,7 @@ def test_brake_is_sent_while_depth_is_missing() -> None:
         inputs=lambda inputs: replace(inputs, obstacles=sectors(vehicle.now_ns) if seen else None),
     )
     harness.run(0.1)
-    harness.command(GotoBehaviour(from_here_m=(30.0, 0.0)))
+    harness.command(GotoBehaviour(Goto(forward_m=30.0, right_m=0.0)))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(1.0)
     assert math.hypot(*sent_velocity(harness)) > 1.0

@@ -16,7 +16,7 @@ from companion.guidance import grammar
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
 from companion.guidance.behaviours.follow_path import FollowPath, FollowPathBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
@@ -48,7 +48,7 @@ def off_the_line(position: Sequence[float], start: Sequence[float], end: Sequenc
 
 
 def test_goto_flies_straight_with_yaw_along_the_path() -> None:
-    flight, outcome = active(GotoBehaviour(from_home_m=(20.0, -10.0), altitude_m=8.0))
+    flight, outcome = active(GotoBehaviour(Goto(north_m=20.0, east_m=-10.0, altitude_m=8.0)))
     assert outcome.success
     assert math.dist(flight.vehicle.position, (20.0, -10.0, -8.0)) < 0.5
     assert max(off_the_line(position, (0, 0, -5), (20, -10, -8)) for position in flight.track) < 0.3
@@ -64,19 +64,21 @@ def test_goto_flies_straight_with_yaw_along_the_path() -> None:
 
 def test_goto_in_body_frame_with_a_heading() -> None:
     vehicle = KinematicVehicle(position=[5.0, 5.0, -5.0], yaw_rad=math.pi / 2)
-    flight, outcome = active(GotoBehaviour(from_here_m=(10.0, 2.0), heading_rad=math.pi), vehicle=vehicle)
+    flight, outcome = active(
+        GotoBehaviour(Goto(forward_m=10.0, right_m=2.0, heading_deg=math.degrees(math.pi))), vehicle=vehicle
+    )
     assert outcome.success
     assert math.dist(flight.vehicle.position, (3.0, 15.0, -5.0)) < 0.5
     assert abs(wrap_angle(flight.vehicle.yaw_rad - math.pi)) < 0.05
 
 
 def test_goto_current_position_succeeds() -> None:
-    _, outcome = active(GotoBehaviour(from_here_m=(0.0, 0.0)), 10.0)
+    _, outcome = active(GotoBehaviour(Goto(forward_m=0.0, right_m=0.0)), 10.0)
     assert outcome.success
 
 
 def test_goto_by_latitude_needs_a_global_position() -> None:
-    behaviour = GotoBehaviour(global_deg=(47.0, 8.0))
+    behaviour = GotoBehaviour(Goto(latitude_deg=47.0, longitude_deg=8.0))
     _, outcome = active(behaviour)
     assert_failed(outcome, "not received")
 
@@ -84,7 +86,7 @@ def test_goto_by_latitude_needs_a_global_position() -> None:
 def test_goto_by_latitude_and_longitude() -> None:
     vehicle = KinematicVehicle()
     state = replace(vehicle.state, global_ns=vehicle.now_ns, latitude_deg=47.397742, longitude_deg=8.545594)
-    behaviour = GotoBehaviour(global_deg=(47.397742 + 1e-4, 8.545594))
+    behaviour = GotoBehaviour(Goto(latitude_deg=47.397742 + 1e-4, longitude_deg=8.545594))
     behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
     step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
     assert isinstance(step, Setpoint)
@@ -113,7 +115,7 @@ class WrongVelocity(KinematicVehicle):
 
 
 def test_goto_arrives_though_the_estimated_speed_is_wrong() -> None:
-    flight, outcome = active(GotoBehaviour(from_home_m=(15.0, 0.0)), 60.0, WrongVelocity())
+    flight, outcome = active(GotoBehaviour(Goto(north_m=15.0, east_m=0.0)), 60.0, WrongVelocity())
     assert outcome.success, outcome.reason
     assert math.dist(flight.vehicle.position, (15.0, 0.0, -5.0)) < 0.5
 
@@ -121,7 +123,7 @@ def test_goto_arrives_though_the_estimated_speed_is_wrong() -> None:
 @pytest.mark.parametrize(("error_mps", "reached"), [(0.7, True), (1.0, False)])
 def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, reached: bool) -> None:
     vehicle = WrongVelocity(error_mps=error_mps)
-    _, outcome = active(GotoBehaviour(from_home_m=(15.0, 0.0)), 60.0, vehicle)
+    _, outcome = active(GotoBehaviour(Goto(north_m=15.0, east_m=0.0)), 60.0, vehicle)
     away_m = math.dist(vehicle.position, (15.0, 0.0, -5.0))
     assert outcome.success
     assert outcome.goal_ned_m == (15.0, 0.0, -5.0)
@@ -130,7 +132,7 @@ def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, r
 
 
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
-    flight = Flight(GotoBehaviour(from_home_m=(60.0, 0.0)), limits=Limits(max_distance_m=30.0))
+    flight = Flight(GotoBehaviour(Goto(north_m=60.0, east_m=0.0)), limits=Limits(max_distance_m=30.0))
     assert_failed(flight.run(120.0), "no progress", "guidance")
 
 
@@ -190,13 +192,13 @@ def test_closed_path_starts_at_its_first_point() -> None:
 
 
 def test_steep_path_stays_on_its_line_within_climb_limit() -> None:
-    flight, outcome = active(GotoBehaviour(from_home_m=(30.0, 0.0), altitude_m=35.0, speed_mps=8.0))
+    flight, outcome = active(GotoBehaviour(Goto(north_m=30.0, east_m=0.0, altitude_m=35.0, speed_mps=8.0)))
     assert outcome.success
     assert max(off_the_line(position, (0, 0, -5), (30, 0, -35)) for position in flight.track) < 1.5
 
 
 def test_slow_climb_keeps_its_speed() -> None:
-    behaviour = GotoBehaviour(from_here_m=(0.0, 0.0), altitude_m=8.0, speed_mps=0.2)
+    behaviour = GotoBehaviour(Goto(forward_m=0.0, right_m=0.0, altitude_m=8.0, speed_mps=0.2))
     flight, outcome = active(behaviour)
     assert outcome.success
     steps = itertools.pairwise(flight.track)

@@ -17,6 +17,7 @@ from tests.companion.guidance.guidance_harness import (
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 ROUND = ((0.0, 0.0), (24.0, 0.0), (24.0, 24.0), (0.0, 24.0))
+PATH, SMALL = "0,0 24,0 24,24 0,24", "0,0 12,0 12,12 0,12"
 
 
 def active(
@@ -44,7 +45,7 @@ def nearest(flight: Flight, point: Sequence[float]) -> float:
 
 def test_other_class_and_unconfirmed_target_do_not_stop_its_lap() -> None:
     objects = [SeenObject("person", 10, 3), SeenObject("car", 15.0, 4.0, trusted=False)]
-    reason, notes, flight = active(PatrolBehaviour(ROUND, ["car"], laps=1.0), objects)
+    reason, notes, flight = active(PatrolBehaviour(Patrol(PATH, "car", laps=1.0)), objects)
     assert reason.endswith("1 lap of 4 points flown, 0 stops")
     assert notes == []
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
@@ -52,7 +53,7 @@ def test_other_class_and_unconfirmed_target_do_not_stop_its_lap() -> None:
 
 def test_patrol_stops_faces_reports_and_continues() -> None:
     car = SeenObject("car", 18.0, 6.0, track_id=7)
-    behaviour = PatrolBehaviour(ROUND, ["person", "car"], laps=1.0, dwell_s=4.0)
+    behaviour = PatrolBehaviour(Patrol(PATH, "person,car", laps=1.0, dwell_s=4.0))
     standing: list[tuple[tuple[float, ...], float]] = []
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -76,7 +77,9 @@ def test_patrol_stops_faces_reports_and_continues() -> None:
 
 def test_patrol_with_approach_returns_to_its_path() -> None:
     car = SeenObject("car", 16.0, 9.0, track_id=3)
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
+    behaviour = PatrolBehaviour(
+        Patrol(PATH, "car", laps=1.0, dwell_s=1.0, on_detection="approach", distance_m=4.0)
+    )
     _, notes, flight = active(behaviour, [car])
     assert notes[1].startswith("patrol: reached ")
     assert "reached car" in notes[1]
@@ -89,7 +92,9 @@ def test_patrol_approaches_the_object_that_it_faced() -> None:
     """And not the nearer one in that direction, which is not confident enough to be found."""
     car = SeenObject("car", 16.0, 9.0, track_id=3)
     nearer = SeenObject("car", 10.5, 5.7, track_id=4, track_score=0.3)
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, approach_m=4.0, dwell_s=1.0)
+    behaviour = PatrolBehaviour(
+        Patrol(PATH, "car", laps=1.0, dwell_s=1.0, on_detection="approach", distance_m=4.0)
+    )
     _, notes, flight = active(behaviour, [car, nearer])
     assert "found a car (track 3)" in notes[0]
     assert notes[1].startswith("patrol: reached ")
@@ -98,25 +103,25 @@ def test_patrol_approaches_the_object_that_it_faced() -> None:
 
 def test_object_with_a_new_id_is_known_by_its_place() -> None:
     car = SeenObject("car", 6.0, 3.0, track_id=1)
-    small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         # Unseen for longer than the table remembers; then it has a new id of the tracker, too.
         car.visible = not 12.0 < seconds < 90.0
         car.track_id = 1 if seconds < 90.0 else 2
 
-    behaviour = PatrolBehaviour(small, ["car"], laps=6.0, dwell_s=1.0, revisit_s=600.0)
+    behaviour = PatrolBehaviour(Patrol(SMALL, "car", laps=6.0, dwell_s=1.0, revisit_s=600.0))
     _, notes, _ = active(behaviour, [car], 400, each=each)
     assert len(notes) == 1
 
 
 @pytest.mark.parametrize("with_identity", [True, False])
 def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> None:
-    small = ((0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0))
     car = SeenObject("car", 6.0, 3.0, track_id=7 if with_identity else None)
-    _, notes, _ = active(PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=600.0), [car], 400)
+    _, notes, _ = active(
+        PatrolBehaviour(Patrol(SMALL, "car", laps=2.0, dwell_s=1.0, revisit_s=600.0)), [car], 400
+    )
     assert len(notes) == 1
-    behaviour = PatrolBehaviour(small, ["car"], laps=2.0, dwell_s=1.0, revisit_s=10.0)
+    behaviour = PatrolBehaviour(Patrol(SMALL, "car", laps=2.0, dwell_s=1.0, revisit_s=10.0))
     _, notes, _ = active(behaviour, [car], 400)
     assert len(notes) >= 2
 
@@ -124,14 +129,14 @@ def test_same_object_stops_it_again_after_revisit_only(with_identity: bool) -> N
 def test_two_objects_stop_it_once_each_the_nearer_first() -> None:
     far = SeenObject("car", 20.0, 11.0, track_id=1, track_score=0.9)
     near = SeenObject("car", 15.0, 4.0, track_id=2, track_score=0.6)
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0, dwell_s=1.0)
+    behaviour = PatrolBehaviour(Patrol(PATH, "car", laps=1.0, dwell_s=1.0))
     _, notes, _ = active(behaviour, [far, near])
     assert [note.split("(")[1][:7] for note in notes] == ["track 2", "track 1"]
 
 
 def test_object_lost_before_facing_is_logged() -> None:
     car = SeenObject("car", 12.0, 8.0, track_id=9)
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
+    behaviour = PatrolBehaviour(Patrol(PATH, "car", laps=1.0))
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         if "facing" in behaviour.status:
@@ -142,7 +147,7 @@ def test_object_lost_before_facing_is_logged() -> None:
 
 
 def test_silent_detector_stops_then_ends_the_patrol() -> None:
-    behaviour = PatrolBehaviour(ROUND, ["car"], laps=1.0)
+    behaviour = PatrolBehaviour(Patrol(PATH, "car", laps=1.0))
     flight = Flight(behaviour, KinematicVehicle())
 
     def short(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -150,7 +155,7 @@ def test_silent_detector_stops_then_ends_the_patrol() -> None:
 
     assert_succeeded(flight.run(200.0, short))
 
-    flight = Flight(PatrolBehaviour(ROUND, ["car"], laps=1.0), KinematicVehicle())
+    flight = Flight(PatrolBehaviour(Patrol(PATH, "car", laps=1.0)), KinematicVehicle())
 
     def silent(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
@@ -183,7 +188,7 @@ def test_patrol_grammar() -> None:
 def test_patrol_ends_by_pilot_or_by_a_new_command() -> None:
     harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
     harness.run(0.1)
-    future = harness.command(PatrolBehaviour(ROUND, ["car"]))
+    future = harness.command(PatrolBehaviour(Patrol(PATH, "car")))
     harness.until(lambda: harness.vehicle.position[0] > 3.0)
     harness.autopilot.change_mode(FlightMode.POSITION)
     harness.until(future.done, 2.0)

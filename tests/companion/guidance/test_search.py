@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guidance.behaviours.seek import SearchBehaviour
+from companion.guidance.behaviours.seek import SearchBehaviour, Seek
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.objects.target import DOUBTED
@@ -83,14 +83,20 @@ def test_search_finds_an_object_hidden_from_the_centre(text: str) -> None:
 
 def test_search_covers_the_area_and_reports_the_reason() -> None:
     doubtful = SeenObject("car", 6.0, 2.0, trusted=False)
-    flight = Flight(SearchBehaviour("car", radius_m=8.0, spacing_m=8.0), KinematicVehicle(), [doubtful])
+    flight = Flight(
+        SearchBehaviour(Seek("car", pattern="square", radius_m=8.0, spacing_m=8.0)),
+        KinematicVehicle(),
+        [doubtful],
+    )
     outcome = flight.run(120.0)
     assert outcome is not None
     assert outcome.reason.endswith(DOUBTED)
 
 
 def test_search_without_footprint_needs_spacing() -> None:
-    outcome = Flight(SearchBehaviour("car", radius_m=30.0), KinematicVehicle()).run(1.0)
+    outcome = Flight(SearchBehaviour(Seek("car", pattern="square", radius_m=30.0)), KinematicVehicle()).run(
+        1.0
+    )
     assert outcome is not None
     assert outcome.reason.endswith("set spacing")
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 import pytest
 
 from companion.guidance.behaviour import Outcome
-from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
@@ -24,7 +24,7 @@ def test_seek_finds_and_faces_an_object(degrees: float) -> None:
     angle = math.radians(degrees)
     car = SeenObject("car", 12.0 * math.cos(angle), 12.0 * math.sin(angle))
     vehicle = KinematicVehicle()
-    outcome = found(Flight(SeekBehaviour("car"), vehicle, [car]))
+    outcome = found(Flight(SeekBehaviour(Seek("car")), vehicle, [car]))
     assert abs(wrap_angle(angle - vehicle.yaw_rad)) < math.radians(5)
     assert "12.0 m" in outcome.reason
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.2
@@ -38,14 +38,14 @@ def test_seek_gives_up_after_its_laps() -> None:
         turned[0] += wrap_angle(vehicle.yaw_rad - turned[1])
         turned[1] = vehicle.yaw_rad
 
-    flight = Flight(SeekBehaviour("car"), vehicle, [SeenObject("person", 5.0, 5.0)])
+    flight = Flight(SeekBehaviour(Seek("car")), vehicle, [SeenObject("person", 5.0, 5.0)])
     assert_failed(flight.run(90.0, each), "2 laps")
     assert turned[0] / math.tau == pytest.approx(2.0, abs=0.02)
 
 
 def test_seek_turns_counterclockwise() -> None:
     vehicle = KinematicVehicle()
-    Flight(SeekBehaviour("car", clockwise=False), vehicle).run(2.0)
+    Flight(SeekBehaviour(Seek("car", direction="counterclockwise")), vehicle).run(2.0)
     assert vehicle.yaw_rad < -0.5
 
 
@@ -55,14 +55,14 @@ def test_single_false_detection_is_ignored() -> None:
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         ghost.visible = 0.3 < seconds < 0.42
 
-    outcome = Flight(SeekBehaviour("car", laps=1.0), objects=[ghost]).run(60.0, each)
+    outcome = Flight(SeekBehaviour(Seek("car", laps=1.0)), objects=[ghost]).run(60.0, each)
     assert outcome is not None
     assert outcome.reason.endswith("1 lap")
 
 
 def test_turn_continues_when_the_find_disappears() -> None:
     car = SeenObject("car", 0.0, 10.0)
-    flight = Flight(SeekBehaviour("car", laps=1.0), objects=[car])
+    flight = Flight(SeekBehaviour(Seek("car", laps=1.0)), objects=[car])
     in_view_since: list[float] = []
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
@@ -75,11 +75,11 @@ def test_turn_continues_when_the_find_disappears() -> None:
 
 def test_low_confidence_detections_do_not_count() -> None:
     weak = SeenObject("car", 10.0, 0.0, confidence=0.3)
-    assert_failed(Flight(SeekBehaviour("car", laps=0.5), objects=[weak]).run(60.0))
+    assert_failed(Flight(SeekBehaviour(Seek("car", laps=0.5)), objects=[weak]).run(60.0))
 
 
 def test_silent_detector_stops_then_ends_the_turn() -> None:
-    flight = Flight(SeekBehaviour("car"))
+    flight = Flight(SeekBehaviour(Seek("car")))
 
     def each(seconds: float, vehicle: KinematicVehicle) -> None:
         flight.perception_alive = seconds < 3.0
@@ -92,7 +92,7 @@ def test_silent_detector_stops_then_ends_the_turn() -> None:
 
 
 def whole_turn(laps: float = 2.0) -> SeekBehaviour:
-    return SeekBehaviour("car", whole_turn=True, laps=laps)
+    return SeekBehaviour(Seek("car", laps=laps), whole_turn=True)
 
 
 def faces(vehicle: KinematicVehicle, scene_object: SeenObject) -> bool:
@@ -114,7 +114,7 @@ def test_without_whole_turn_the_first_find_is_faced() -> None:
     first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
     surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
     vehicle = KinematicVehicle()
-    Flight(SeekBehaviour("car"), vehicle, [first, surer]).run(60.0)
+    Flight(SeekBehaviour(Seek("car")), vehicle, [first, surer]).run(60.0)
     assert faces(vehicle, first)
 
 
@@ -225,7 +225,7 @@ def test_find_with_new_track_ids_is_faced_without_delay() -> None:
                 car.track_id = (car.track_id or 0) + 1
             seen_s[0] = seconds
 
-    behaviour = SeekBehaviour("car", whole_turn=True, rate_radps=0.25)
+    behaviour = SeekBehaviour(Seek("car", rate_radps=0.25), whole_turn=True)
     found(Flight(behaviour, vehicle, [car]), each)
     assert car.track_id == 2
     assert times[-1] < math.tau / 0.25 + 3.5

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, GimbalStatus, Outcome
-from companion.guidance.behaviours.approach import ApproachBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.seek import SeekBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.gimbal.pitch import GimbalSweep
@@ -39,7 +39,7 @@ def sweep(end_deg: float = -60.0, rate_dps: float = 20.0) -> GimbalSweep:
 
 
 def seek() -> SeekBehaviour:
-    return SeekBehaviour("car", sweep=sweep())
+    return SeekBehaviour(Seek("car"), sweep=sweep())
 
 
 def gimbal(now_ns: int, pitch_deg: float = 0.0, **changes: Any) -> GimbalState:
@@ -110,7 +110,7 @@ def test_missing_gimbal_requirements_are_named(
 
 def test_nothing_is_missing_and_no_sweep_needs_no_gimbal() -> None:
     assert check_requirements(seek(), context(gimbal(NOW_NS)), None) is None
-    assert check_requirements(SeekBehaviour("car"), context(None, GimbalStatus()), None) is None
+    assert check_requirements(SeekBehaviour(Seek("car")), context(None, GimbalStatus()), None) is None
     assert (
         check_requirements(
             PointGimbalBehaviour(GimbalAim(-0.5)), context(gimbal(NOW_NS), GimbalStatus()), None
@@ -119,7 +119,9 @@ def test_nothing_is_missing_and_no_sweep_needs_no_gimbal() -> None:
     )
 
 
-@pytest.mark.parametrize("behaviour", [SeekBehaviour("car"), ApproachBehaviour(Subject("car"))])
+@pytest.mark.parametrize(
+    "behaviour", [SeekBehaviour(Seek("car")), ApproachBehaviour(Approach(Subject("car"), retries=0.0))]
+)
 def test_unknown_camera_direction_is_refused(
     behaviour: SeekBehaviour | ApproachBehaviour,
 ) -> None:
@@ -192,7 +194,7 @@ def test_silent_gimbal_ends_seek_with_the_reason() -> None:
 )
 @pytest.mark.parametrize("ended", [False, True])
 def test_cleared_gimbal_attitude_ends_the_sweep(left: GimbalState | None, ended: bool) -> None:
-    behaviour = SeekBehaviour("car", sweep=sweep(), laps=0.1)
+    behaviour = SeekBehaviour(Seek("car", laps=0.25), sweep=sweep())
     harness = harness_with_gimbal()
     command = engaged(harness, behaviour)
     harness.until(lambda: bool(behaviour._failure) is ended, 20.0)  # after a failure the gimbal returns

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import VelocityInput
-from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
@@ -200,7 +200,7 @@ def test_nothing_starts_after_a_standstill(phase: str, seconds: float, suspended
 
 def test_end_of_the_command_names_the_suspend() -> None:
     harness = in_flight()
-    pending = harness.command(GotoBehaviour(from_home_m=(50.0, 0.0)))
+    pending = harness.command(GotoBehaviour(Goto(north_m=50.0, east_m=0.0)))
     harness.until(lambda: harness.guidance.phase == "offboard")
     harness.stand_still(42.0, suspended=True)
     harness.run()
@@ -300,7 +300,7 @@ def test_track_from_before_a_suspend_is_forgotten() -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=True)
     harness.run(1.1)
-    assert_failed(harness.command(ApproachBehaviour(Subject(track_id=7))).result())
+    assert_failed(harness.command(ApproachBehaviour(Approach(Subject(track_id=7)))).result())
 
 
 def test_waiting_command_is_answered_after_a_standstill() -> None:

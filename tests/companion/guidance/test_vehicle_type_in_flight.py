@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.behaviours.goto import GotoBehaviour
+from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.orbit import OrbitBehaviour
@@ -99,4 +99,4 @@ def test_type_that_changes_while_landing_ends_the_command(identity: Identity) ->
 def test_hovering_vtol_of_px4_flies_like_a_multicopter() -> None:
     harness = Vehicle(HOVERING)
     engaged(harness, HoldBehaviour())
-    assert harness.outcome(harness.command(GotoBehaviour(from_here_m=(2.0, 0.0))), 30.0).success
+    assert harness.outcome(harness.command(GotoBehaviour(Goto(forward_m=2.0, right_m=0.0))), 30.0).success
