@@ -30,7 +30,7 @@ from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.objects.tracked_object import GimbalGoal, Subject
 from companion.guidance.search_pattern import Footprint
-from vision.class_names import class_named, near_names
+from vision.class_names import class_named
 from vision.registry import RegistrationError
 
 MOST_POINTS = 500
@@ -64,21 +64,6 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
-class ClassName:
-    """The name of an object class.
-
-    >>> from typing import Annotated
-    >>> from companion import ClassName
-    >>> Target = Annotated[str, ClassName("class", "of the object")]  # the type of a command's field
-    >>> Target.__metadata__[0].key
-    'class'
-    """
-
-    key: str
-    meaning: str
-
-
-@dataclass(frozen=True, slots=True)
 class EnumArgument:
     """One of a fixed set of words.
 
@@ -95,54 +80,49 @@ class EnumArgument:
 
 
 @dataclass(frozen=True, slots=True)
-class Points:
-    """A list of points, `north,east` or `north,east,height`, metres from home."""
+class Text:
+    """An argument that is read as it is written."""
 
     key: str
     meaning: str
 
 
-@dataclass(frozen=True, slots=True)
-class FileName:
-    """The name of a file, or a path."""
+class ClassName(Text):
+    """The name of an object class.
 
-    key: str
-    meaning: str
-
-
-@dataclass(frozen=True, slots=True)
-class Word:
-    """A free word, such as a vehicle's name."""
-
-    key: str
-    meaning: str
+    >>> from typing import Annotated
+    >>> from companion import ClassName
+    >>> Target = Annotated[str, ClassName("class", "of the object")]  # the type of a command's field
+    >>> Target.__metadata__[0].key
+    'class'
+    """
 
 
-@dataclass(frozen=True, slots=True)
-class ClassNames:
+class ClassNames(Text):
     """Names of object classes, separated by commas."""
 
-    key: str
-    meaning: str
+
+class Points(Text):
+    """A list of points, `north,east` or `north,east,height`, metres from home."""
 
 
-@dataclass(frozen=True, slots=True)
-class TrackId:
+class FileName(Text):
+    """The name of a file, or a path."""
+
+
+class Word(Text):
+    """A free word, such as a vehicle's name."""
+
+
+class TrackId(Text):
     """The `track_id` of an object in the steering camera's detections."""
 
-    key: str
-    meaning: str
 
-
-@dataclass(frozen=True, slots=True)
-class MarkerId:
+class MarkerId(Text):
     """The id of a printed marker."""
 
-    key: str
-    meaning: str
 
-
-Argument = Number | ClassName | EnumArgument | Points | FileName | ClassNames | Word | TrackId | MarkerId
+Argument = Number | EnumArgument | Text
 
 
 def names_in(text: str) -> tuple[str, ...]:
@@ -216,11 +196,6 @@ def range_of(argument: Number) -> str:
     return (
         f"a number from {argument.low:g} to {argument.high:g}{' ' + argument.unit if argument.unit else ''}"
     )
-
-
-def nearest(word: str, known: list[str]) -> str:
-    """Suggest known words close to an unknown one, or list the known words."""
-    return near_names(word, known)
 
 
 @dataclass(frozen=True, slots=True)

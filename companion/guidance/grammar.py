@@ -13,6 +13,7 @@ key, unit and allowed range, so a command made in code has the same limits, and
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import MISSING, dataclass
@@ -21,20 +22,16 @@ from typing import Any
 from companion.guidance.command import (
     COMMANDS,
     LAST_MARKER_ID,
-    MARKER_ID_TEXT,
-    TRACK_ID_TEXT,
     Argument,
     ClassName,
     ClassNames,
     Command,
     EnumArgument,
-    FileName,
     GrammarError,
     MarkerId,
     Number,
     Points,
     TrackId,
-    Word,
     arguments_of,
     default_of,
     either_of,
@@ -42,10 +39,8 @@ from companion.guidance.command import (
     make_stated,
     names_in,
     names_text,
-    nearest,
-    range_of,
 )
-from vision.class_names import joined_names
+from vision.class_names import joined_names, near_names
 
 
 def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
@@ -64,10 +59,10 @@ def parse(text: str, class_names: Sequence[str] | None = None) -> Command:
         raise GrammarError(f"no command; known: {', '.join(COMMANDS)}")
     word = tokens[0].text.lower()
     if word not in COMMANDS or tokens[0].key is not None:
-        raise GrammarError(f"unknown command {tokens[0].whole!r}; {nearest(word, list(COMMANDS))}")
+        raise GrammarError(f"unknown command {tokens[0].whole!r}; {near_names(word, list(COMMANDS))}")
     kind = COMMANDS[word]
     values = {
-        name: _value(word, argument, written, class_names)
+        name: _value(argument, written, class_names)
         for name, argument, written in _assigned(kind, tokens[1:])
     }
     for field, argument in arguments_of(kind):
@@ -261,36 +256,27 @@ def _assigned(kind: type[Command], tokens: list[_Token]) -> Iterator[tuple[str, 
                 f"{kind.word}: {token.key}= was renamed to {now}= in version 0.2.0: {usage(kind)}"
             )
         if token.key not in by_key:
-            known = nearest(token.key, list(by_key)) if by_key else "the command takes no arguments"
+            known = near_names(token.key, list(by_key)) if by_key else "the command takes no arguments"
             raise GrammarError(f"{kind.word}: unknown argument {token.key!r}; {known}")
         yield claim(token.key, token.text)
 
 
-def _value(word: str, argument: Argument, text: str, class_names: Sequence[str] | None) -> float | int | str:
+def _value(argument: Argument, text: str, class_names: Sequence[str] | None) -> float | int | str:
     match argument:
-        case Number(key, unit):
-            number = text.removesuffix(unit) if unit else text
-            try:
-                return float(number)
-            except ValueError:
-                raise GrammarError(f"{word}: {key} must be {range_of(argument)}, got {text!r}") from None
-        case TrackId(key):
-            # At most as many digits as the greatest one has: Python refuses to read thousands.
-            if not re.fullmatch(r"[0-9]{1,19}", text):
-                raise GrammarError(f"{word}: {key} must be {TRACK_ID_TEXT}, got {text!r}")
-            return int(text)
-        case MarkerId(key):
-            if not re.fullmatch(r"[0-9]{1,4}", text):
-                raise GrammarError(f"{word}: {key} must be {MARKER_ID_TEXT}, got {text!r}")
+        # What is no number stays text, which the command then refuses.
+        case Number(unit=unit):
+            with contextlib.suppress(ValueError):
+                return float(text.removesuffix(unit) if unit else text)
+        # At most as many digits as the greatest one has: Python refuses to read thousands.
+        case TrackId() | MarkerId() if re.fullmatch(r"[0-9]{1,19}", text):
             return int(text)
         case EnumArgument():
             return text.lower()
-        case Points() | FileName() | Word():
-            return text
         case ClassNames():
             names = names_in(text)
             if class_names is not None:
                 names = tuple(known_class(name, class_names) for name in joined_names(names, class_names))
             return names_text(names)
-        case ClassName():
-            return text if class_names is None else known_class(text, class_names)
+        case ClassName() if class_names is not None:
+            return known_class(text, class_names)
+    return text

@@ -8,9 +8,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from companion.guidance.command import COMMANDS, Command, GrammarError, known_class, nearest
+from companion.guidance.command import COMMANDS, Command, GrammarError, known_class
 from companion.guidance.grammar import parse
 from companion.language.clauses import QUESTIONS, Question
+from vision.class_names import near_names
 
 MAX_CALLS = 50
 _QUESTION_HELP = {
@@ -69,7 +70,7 @@ def check_words(name: str, words: Sequence[str], *, for_models: bool = False) ->
     """
     for word in words:
         if word not in COMMANDS:
-            raise ValueError(f"{name}: unknown command {word!r}; {nearest(word, list(COMMANDS))}")
+            raise ValueError(f"{name}: unknown command {word!r}; {near_names(word, list(COMMANDS))}")
         if for_models and word in _NOT_FOR_MODELS:
             raise ValueError(f"{name}: {word} is not for a model: the call does not show the command")
 
@@ -181,7 +182,7 @@ def read_call(call: ToolCall, class_names: Sequence[str] | None) -> Command | Qu
         return Question(call.name, (about if class_names is None else known_class(about, class_names),))
     if call.name not in COMMANDS:
         known = [word for word in COMMANDS if word not in _NOT_FOR_MODELS]
-        raise GrammarError(f"unknown command {call.name[:80]!r}; {nearest(call.name[:80], known)}")
+        raise GrammarError(f"unknown command {call.name[:80]!r}; {near_names(call.name[:80], known)}")
     _check_offered(call.name)
     command = parse(
         " ".join([call.name, *(_written(call.name, *item) for item in given.items())]), class_names

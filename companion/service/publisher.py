@@ -223,10 +223,9 @@ class Publisher:
     def _publish_vehicle(self, guidance: Guidance, streamer: Streamer, now_ns: int) -> None:
         bus, state = self._bus, self._driver.state
         bus.publish(topics.VEHICLE, lambda: vehicle_message(state, now_ns))
+        note, poses = None if guidance.active is None else guidance.active.note, self._inputs.poses
         # By the clock that counts a suspend: until guidance's next step the state may be from before it.
-        clock_ns = self._driver.watch.now_ns()
-        note, in_command = None if guidance.active is None else guidance.active.note, guidance.in_command
-        pose = self._inputs.poses.pose(state, note, clock_ns, in_command=in_command)
+        pose = poses.pose(state, note, self._driver.watch.now_ns(), in_command=guidance.in_command)
         if pose is not None:
             bus.publish(topics.POSE, lambda: pose_message(pose))
         if guidance.in_command:

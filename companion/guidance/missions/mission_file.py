@@ -33,7 +33,6 @@ from companion.guidance.command import (
     FileName,
     GrammarError,
     behaviour,
-    nearest,
 )
 from companion.guidance.grammar import parse
 from companion.guidance.missions.sequence import (
@@ -48,6 +47,7 @@ from companion.guidance.missions.sequence import (
 )
 from companion.guidance.search_pattern import Footprint
 from companion.toml_text import parse_toml
+from vision.class_names import near_names
 from vision.file_kinds import explained, kind_of_text
 from vision.text_file import read_text
 
@@ -260,7 +260,7 @@ def _problem_text(source: str, problem: dict[str, object]) -> str:
     key = next((str(part) for part in location if isinstance(part, str)), "")
     if problem["type"] == "extra_forbidden":
         known = list(StepTable.model_fields if len(words) == 2 else MissionTable.model_fields)
-        return f"{': '.join(words)}: unknown key {key!r}; {nearest(key, known)}"
+        return f"{': '.join(words)}: unknown key {key!r}; {near_names(key, known)}"
     if problem["type"] == "missing":
         text = "a mission needs at least one [[step]]" if key == "step" else f"{key} is missing"
         return f"{': '.join(words)}: {text}"
@@ -318,7 +318,7 @@ def _read_steps(
                 followers.append(named.get(word))
             else:
                 known = [*_WORDS, *named]
-                problems.append(f"{where}: {key}: unknown step {word!r}; {nearest(word, known)}")
+                problems.append(f"{where}: {key}: unknown step {word!r}; {near_names(word, known)}")
                 followers.append(None)
         read.append(_Read(step, *followers))
         if step.do is None:
@@ -338,11 +338,7 @@ def _read_steps(
 
 def _unreached(read: Sequence[_Read], source: str) -> list[str]:
     """A line for every unreachable step."""
-    reached, waiting = {0}, [0] if read else []
-    while waiting:
-        fresh = _steps_after(read, waiting.pop()) - reached
-        reached |= fresh
-        waiting += fresh
+    reached = {0} | (_reach(read, 0) if read else set())
     return [
         f"{source}: {_called(index, step.table)}: unreachable"
         for index, step in enumerate(read)
