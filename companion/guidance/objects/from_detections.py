@@ -11,6 +11,7 @@ from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from types import MappingProxyType
 from typing import NamedTuple, TypeVar
 
@@ -22,15 +23,12 @@ from companion.guidance.objects.range_error import (
     BoxError,
     PoseError,
     across_sigma_m,
-    depth_distance_sigma_m,
-    depth_range_sigma_m,
     depth_sigma_m,
+    depth_sigmas_m,
     edge_sigma_px,
-    ground_distance_sigma_m,
-    ground_range_sigma_m,
+    ground_sigmas_m,
     height_sigma_m,
-    size_distance_sigma_m,
-    size_range_sigma_m,
+    size_sigmas_m,
 )
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.gimbal import YawFrame
@@ -112,27 +110,23 @@ class StateHistory:
 
     def __init__(self, duration_s: float = HISTORY_S) -> None:
         self._duration_ns = round(duration_s * 1e9)
-        self._taken_ns = (0, 0, 0)
+        self._taken_ns = [0, 0, 0]
         self._attitudes: deque[tuple[int, Quaternion]] = deque()
         self._positions: deque[tuple[int, tuple[float, ...]]] = deque()
         self._gimbal: deque[tuple[int, tuple[Quaternion, YawFrame]]] = deque()
 
     def add(self, state: VehicleState) -> None:
         """Add the new samples of a snapshot; older or repeated stamps are ignored."""
-        if state.attitude is not None and _newer(self._attitudes, state.attitude_ns):
-            self._attitudes.append((state.attitude_ns, state.attitude))
-            self._forget(self._attitudes)
-        position, height_m = state.position_ned_m, state.height_m
-        if position is not None and height_m is not None and _newer(self._positions, state.position_ns):
+        if state.attitude is not None:
+            self._append(self._attitudes, state.attitude_ns, state.attitude)
+        position, height_m, gimbal = state.position_ned_m, state.height_m, state.gimbal
+        if position is not None and height_m is not None:
             sigma_m = height_sigma_m(state.height_source, height_m, state.vertical_sigma_m)
             sigma_m = max(sigma_m, state.height_disagreement_m)
             error_m = (sigma_m, state.horizontal_sigma_m or UNSTATED_POSITION_SIGMA_M)
-            self._positions.append((state.position_ns, (*position, height_m, *error_m)))
-            self._forget(self._positions)
-        gimbal = state.gimbal
-        if gimbal is not None and gimbal.attitude is not None and _newer(self._gimbal, gimbal.attitude_ns):
-            self._gimbal.append((gimbal.attitude_ns, (gimbal.attitude, gimbal.yaw_frame)))
-            self._forget(self._gimbal)
+            self._append(self._positions, state.position_ns, (*position, height_m, *error_m))
+        if gimbal is not None and gimbal.attitude is not None:
+            self._append(self._gimbal, gimbal.attitude_ns, (gimbal.attitude, gimbal.yaw_frame))
 
     def discard(self) -> None:
         """The clock of the stamps stood still: between the last sample and the next one anything happened."""
@@ -141,27 +135,18 @@ class StateHistory:
 
     def take_new(self) -> HistorySamples:
         """Return the samples added since the last call, for one caller: a recording."""
-        attitude_ns, position_ns, gimbal_ns = self._taken_ns
-        new = HistorySamples(
-            _after(self._attitudes, attitude_ns),
-            _after(self._positions, position_ns),
-            _after(self._gimbal, gimbal_ns),
+        return HistorySamples(
+            self._taken(0, self._attitudes), self._taken(1, self._positions), self._taken(2, self._gimbal)
         )
-        self._taken_ns = (
-            _newest_ns(new.attitudes, attitude_ns),
-            _newest_ns(new.positions, position_ns),
-            _newest_ns(new.gimbal, gimbal_ns),
-        )
-        return new
 
     def extend(self, samples: HistorySamples) -> None:
         """Add samples of another history, newer than those here."""
-        self._attitudes.extend(samples.attitudes)
-        self._forget(self._attitudes)
-        self._positions.extend(samples.positions)
-        self._forget(self._positions)
-        self._gimbal.extend(samples.gimbal)
-        self._forget(self._gimbal)
+        for stamp_ns, attitude in samples.attitudes:
+            self._append(self._attitudes, stamp_ns, attitude)
+        for stamp_ns, position in samples.positions:
+            self._append(self._positions, stamp_ns, position)
+        for stamp_ns, gimbal in samples.gimbal:
+            self._append(self._gimbal, stamp_ns, gimbal)
 
     def at(self, stamp_ns: int) -> Pose:
         """The pose at a time: attitude by slerp, position by linear interpolation.
@@ -198,9 +183,18 @@ class StateHistory:
         first, second, fraction = _around(self._attitudes, stamp_ns, "attitude of the vehicle")
         return matrix_from_quaternion(slerp(first, second, fraction))
 
-    def _forget(self, samples: deque[tuple[int, _Sample]]) -> None:
-        while samples and samples[0][0] < samples[-1][0] - self._duration_ns:
+    def _append(self, samples: deque[tuple[int, _Sample]], stamp_ns: int, sample: _Sample) -> None:
+        if samples and stamp_ns <= samples[-1][0]:
+            return
+        samples.append((stamp_ns, sample))
+        while samples[0][0] < stamp_ns - self._duration_ns:
             samples.popleft()
+
+    def _taken(self, kind: int, samples: deque[tuple[int, _Sample]]) -> tuple[tuple[int, _Sample], ...]:
+        """The samples newer than the last that was taken, which are few."""
+        newer = list(takewhile(lambda sample: sample[0] > self._taken_ns[kind], reversed(samples)))
+        self._taken_ns[kind] = newer[0][0] if newer else self._taken_ns[kind]
+        return tuple(reversed(newer))
 
 
 def mount_at(mount: CameraMount, history: StateHistory, stamp_ns: int) -> CameraMount:
@@ -374,7 +368,7 @@ def _target(
 ) -> Target:
     left, top, right, bottom = detection["xyxy"]
     direction = sight.direction
-    source, offset, sigma_m, distance_sigma_m = RangeSource.NONE, [math.nan] * 3, math.nan, math.nan
+    source, offset, sigmas_m = RangeSource.NONE, [math.nan] * 3, (math.nan, math.nan)
     whole_below = bottom < camera.height - 1 - EDGE_PX
     box = BoxError(
         sight.pixel_rad,
@@ -389,24 +383,18 @@ def _target(
         source = RangeSource.DEPTH
         offset = _towards(sight.lens, direction, sight.nearest)
         depth_m = detection["nearest_camera_m"][2] if detection["nearest_camera_m"] else math.nan
-        range_and_drop = _range_and_drop(offset, sight.lens)
-        sigma_m = depth_range_sigma_m(*range_and_drop, depth_m, box, pose.error)
-        distance_sigma_m = depth_distance_sigma_m(*range_and_drop, depth_m, box)
+        sigmas_m = depth_sigmas_m(*_range_and_drop(offset, sight.lens), depth_m, box, pose.error)
     elif whole_below and pose.height_m > MIN_HEIGHT_M and math.isfinite(sight.on_ground[0]):
         source = RangeSource.GROUND_PLANE
         offset = _nearer(sight.lens, sight.direction, sight.on_ground, CONTACT_INSET_M)
-        range_and_drop = _range_and_drop(sight.on_ground, sight.lens)
-        sigma_m = ground_range_sigma_m(*range_and_drop, box, pose.error)
-        distance_sigma_m = ground_distance_sigma_m(sigma_m, *range_and_drop, pose.error)
+        sigmas_m = ground_sigmas_m(*_range_and_drop(sight.on_ground, sight.lens), box, pose.error)
     elif height_m is not None and _measurable(camera, top, bottom):
         offset = range_from_known_height(
             camera, mount, pose.ned_from_body, detection["xyxy"], height_m
         ).tolist()
         if all(map(math.isfinite, offset)):
             source = RangeSource.KNOWN_HEIGHT
-            range_and_drop = _range_and_drop(offset, sight.lens)
-            sigma_m = size_range_sigma_m(*range_and_drop, height_m, box, pose.error)
-            distance_sigma_m = size_distance_sigma_m(sigma_m, *range_and_drop, box, pose.error)
+            sigmas_m = size_sigmas_m(*_range_and_drop(offset, sight.lens), height_m, box, pose.error)
     known = source is not RangeSource.NONE
     north, east, down = (origin + away for origin, away in zip(pose.position_ned_m, offset, strict=True))
     return Target(
@@ -425,10 +413,10 @@ def _target(
         depth_m=math.nan if detection["depth_m"] is None else detection["depth_m"],
         depth_sigma_m=math.nan if detection["depth_m"] is None else depth_sigma_m(detection["depth_m"], box),
         distance_m=math.hypot(*offset),
-        distance_sigma_m=distance_sigma_m,
+        distance_sigma_m=sigmas_m[1],
         cut=box.cut,
         cut_above=top <= _edge_margin_px(detection["xyxy"], camera),
-        range_sigma_m=sigma_m,
+        range_sigma_m=sigmas_m[0],
         across_sigma_m=across_sigma_m(*_range_and_drop(offset, sight.lens), box, pose.error),
         vehicle_sigma_m=pose.error.horizontal_m,
     )
@@ -469,24 +457,6 @@ def _nearer(lens: list[float], direction: list[float], foot: list[float], by_m: 
 def _measurable(camera: CameraModel, top: float, bottom: float) -> bool:
     """Whether a box is tall enough and not cut off by the image's upper or lower edge."""
     return top > EDGE_PX and bottom < camera.height - 1 - EDGE_PX and bottom - top >= LEAST_HEIGHT_PX
-
-
-def _after(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> tuple[tuple[int, _Sample], ...]:
-    """The samples newer than a time, which are few."""
-    newer: list[tuple[int, _Sample]] = []
-    for sample in reversed(samples):
-        if sample[0] <= stamp_ns:
-            break
-        newer.append(sample)
-    return tuple(reversed(newer))
-
-
-def _newest_ns(samples: tuple[tuple[int, _Sample], ...], before_ns: int) -> int:
-    return samples[-1][0] if samples else before_ns
-
-
-def _newer(samples: deque[tuple[int, _Sample]], stamp_ns: int) -> bool:
-    return not samples or stamp_ns > samples[-1][0]
 
 
 def _around(samples: deque[tuple[int, _Sample]], stamp_ns: int, what: str) -> tuple[_Sample, _Sample, float]:

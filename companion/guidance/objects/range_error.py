@@ -112,34 +112,49 @@ def height_sigma_m(source: HeightSource | None, height_m: float, stated_m: float
     return HOME_SIGMA_M if stated_m is None else max(stated_m, LEAST_HOME_SIGMA_M)
 
 
-def depth_range_sigma_m(
+def depth_sigmas_m(
     range_m: float, drop_m: float, depth_m: float, box: BoxError, pose: PoseError
-) -> float:
-    """Error of a horizontal range from depth.
+) -> tuple[float, float]:
+    """Errors of a horizontal range from depth, and of the straight distance to the point.
+
+    The noise is along the line of sight; the vehicle's height does not matter, its attitude only to the range.
 
     Args:
         drop_m: from the lens down to the point.
         depth_m: along the optical axis.
     """
-    noise_m = depth_noise_m(depth_m) * range_m / max(depth_m, 1e-3)
-    return math.hypot(noise_m, drop_m * pose.tilt_rad, CUT_DEPTH_SIGMA_M if box.cut else 0.0)
+    noise, cut_m = depth_noise_m(depth_m) / max(depth_m, 1e-3), CUT_DEPTH_SIGMA_M if box.cut else 0.0
+    distance_m = max(math.hypot(range_m, drop_m), 1e-3)
+    of_range_m = math.hypot(noise * range_m, drop_m * pose.tilt_rad, cut_m)
+    return of_range_m, math.hypot(noise * distance_m, cut_m * range_m / distance_m)
 
 
-def ground_range_sigma_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError) -> float:
-    """Error of a horizontal range from the ground, `drop_m` below the lens."""
+def ground_sigmas_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError) -> tuple[float, float]:
+    """Errors of a horizontal range from the ground, `drop_m` below the lens, and of the straight distance.
+
+    An error of the height changes range, drop and distance in proportion. The other causes change the range
+    alone, and the distance by range / distance of it.
+    """
     # range = drop / tan(depression)
     per_rad = range_m**2 / drop_m + drop_m
-    return math.hypot(
+    of_range_m = math.hypot(
         per_rad * math.hypot(box.edge_rad, pose.tilt_rad),
         drop_m * box.column_slope * CONTACT_SIGMA * box.width_px,
         pose.height_m * range_m / drop_m,
         INSET_SIGMA_M,
         CUT_GROUND_SIGMA_M if box.cut else 0.0,
     )
+    level = range_m / math.hypot(range_m, drop_m)
+    return of_range_m, math.hypot(level * of_range_m, math.hypot(1.0, level) * pose.height_m)
 
 
-def size_range_sigma_m(range_m: float, drop_m: float, size_m: float, box: BoxError, pose: PoseError) -> float:
-    """Error of a horizontal range from the known height of an object (`range_from_known_height`).
+def size_sigmas_m(
+    range_m: float, drop_m: float, size_m: float, box: BoxError, pose: PoseError
+) -> tuple[float, float]:
+    """Errors of a horizontal range from the known height of an object, and of the distance to its foot.
+
+    The range is that of `range_from_known_height`. distance = range / cos(depression of the foot), whose error
+    is taken as independent of the range's.
 
     Args:
         drop_m: from the lens down to its foot. size_m: the known height.
@@ -159,49 +174,14 @@ def size_range_sigma_m(range_m: float, drop_m: float, size_m: float, box: BoxErr
         (of_top - of_foot) * pose.tilt_rad,
         DEPTH_OF_WIDTH_SIGMA * width_rad * max(-top, 0.0),
     )
-    return range_m * math.hypot(SIZE_SIGMA_SHARE, spread_sigma / spread)
+    of_range_m = range_m * math.hypot(SIZE_SIGMA_SHARE, spread_sigma / spread)
+    of_foot_m = drop_m * math.hypot(box.edge_rad, pose.tilt_rad)
+    return of_range_m, math.hypot(range_m, drop_m) / range_m * math.hypot(of_range_m, of_foot_m)
 
 
 def depth_sigma_m(depth_m: float, box: BoxError) -> float:
     """Error of the depth of the nearest point along the optical axis."""
     return math.hypot(depth_noise_m(depth_m), CUT_DEPTH_SIGMA_M if box.cut else 0.0)
-
-
-def depth_distance_sigma_m(range_m: float, drop_m: float, depth_m: float, box: BoxError) -> float:
-    """Error of the straight distance to the point of `depth_range_sigma_m`.
-
-    The noise is along the line of sight; the vehicle's height and attitude do not matter.
-    """
-    distance_m = max(math.hypot(range_m, drop_m), 1e-3)
-    noise_m = depth_noise_m(depth_m) * distance_m / max(depth_m, 1e-3)
-    return math.hypot(noise_m, CUT_DEPTH_SIGMA_M * range_m / distance_m if box.cut else 0.0)
-
-
-def ground_distance_sigma_m(sigma_m: float, range_m: float, drop_m: float, pose: PoseError) -> float:
-    """Error of the straight distance to the ground, at a range with the error `ground_range_sigma_m`.
-
-    An error of the height changes range, drop and distance in proportion. The other causes change the range
-    alone, and the distance by range / distance of it.
-
-    Args:
-        sigma_m: that error.
-    """
-    level = range_m / math.hypot(range_m, drop_m)
-    return math.hypot(level * sigma_m, math.hypot(1.0, level) * pose.height_m)
-
-
-def size_distance_sigma_m(
-    sigma_m: float, range_m: float, drop_m: float, box: BoxError, pose: PoseError
-) -> float:
-    """Error of the straight distance to the foot, at a range with the error `size_range_sigma_m`.
-
-    distance = range / cos(depression of the foot), whose error is taken as independent of the range's.
-
-    Args:
-        sigma_m: that error.
-    """
-    slope = math.hypot(range_m, drop_m) / range_m
-    return slope * math.hypot(sigma_m, drop_m * math.hypot(box.edge_rad, pose.tilt_rad))
 
 
 def across_sigma_m(range_m: float, drop_m: float, box: BoxError, pose: PoseError) -> float:
