@@ -156,14 +156,6 @@ class BehaviourRunner:
         else:
             self._lose(why, context.state)
 
-    def clear_failure(self) -> None:
-        """This step raised nothing."""
-        self.failure = ""
-
-    def forget_goal(self) -> None:
-        """Where the behaviour before wanted the vehicle is no longer valid."""
-        self.goal_ned_m = None
-
     def end(self, outcome: Outcome, *, reported: bool = False) -> None:
         """Remove the active behaviour; its command has ended."""
         behaviour, command, busy = self.behaviour, self.command, self.busy
@@ -193,13 +185,13 @@ class BehaviourRunner:
         if command is None:
             self._modes.decide_alone()
         self._activated, self._position_lost_ns = False, None
-        self._setpoints.begin()
+        self._setpoints.blind = False
         self.active, self._landing, self.gimbal_user = None, False, ""
         self.approached, self.needs = None, frozenset()
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""
-        self._setpoints.clear_path()
+        self._setpoints.path = ()
         if Requirement.POSITION in behaviour.needs and not self._position_known(context):
             return
         if not self._activated:

@@ -197,7 +197,7 @@ class Guidance:
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
-            self._runner.forget_goal()  # flown by someone else since
+            self._runner.goal_ned_m = None  # flown by someone else since
         self._mode_changes = inputs.mode_changes
         before, context = self._context, self._observe(now_ns, inputs)
         self._context, self._class_names = context, inputs.class_names
@@ -230,7 +230,7 @@ class Guidance:
         except Exception as error:
             self._runner.handle_error(error, context, inputs.stream.sent_count)
         else:
-            self._runner.clear_failure()
+            self._runner.failure = ""  # this step raised nothing
         self._runner.answer_endless(inputs)
         return self._output(landing_target)
 

@@ -43,6 +43,7 @@ class ModeControl:
         phase: state of our command.
         requested: the mode request that is pending or active; None: none.
         request: identifier of the pending request; None: none.
+        armed_on_ground: we have armed the vehicle, and it has not taken off since.
     """
 
     def __init__(self, setpoints: SetpointOutput, out: OutputCollector) -> None:
@@ -56,7 +57,7 @@ class ModeControl:
         self._engaging_since_ns = 0
         self._sent_before_engaging = 0
         self._yielded: tuple[int, str] | None = None
-        self._armed_on_ground = False
+        self.armed_on_ground = False
         self._disarm: int | None = None
         self._commanded_ns: int | None = None
 
@@ -64,11 +65,6 @@ class ModeControl:
     def yielded(self) -> str | None:
         """Why command was lost, while the autopilot's own reason is awaited; None: it was not."""
         return None if self._yielded is None else self._yielded[1]
-
-    @property
-    def armed_on_ground(self) -> bool:
-        """Whether we have armed the vehicle, and it has not taken off since."""
-        return self._armed_on_ground
 
     def prepare(self, state: VehicleState, received_ns: int) -> None:
         """A command begins: take command of the vehicle, or drop the autopilot mode of the one before.
@@ -95,7 +91,7 @@ class ModeControl:
         self, context: BehaviourContext, inputs: GuidanceInput, paused_s: float, *, landing: bool
     ) -> str | None:
         """Why command was lost; None while in command. Call it once per step. `paused_s`: since the last."""
-        self._armed_on_ground &= context.state.landed is LandedState.ON_GROUND
+        self.armed_on_ground &= context.state.landed is LandedState.ON_GROUND
         stream = inputs.stream.state
         interrupted = None
         if self._setpoints.streaming:
@@ -136,7 +132,7 @@ class ModeControl:
         """Stream a brake; OFFBOARD is requested after `SETPOINTS_BEFORE_OFFBOARD` setpoints."""
         self.drop_request()
         self.phase = Phase.ENGAGING
-        self._setpoints.start()
+        self._setpoints.streaming = True
         self._engaging_since_ns = context.now_ns
         self._sent_before_engaging = sent_count
         self._authority.request(FlightMode.OFFBOARD, context.state)
@@ -165,7 +161,7 @@ class ModeControl:
             action = self._sequence.next(context.now_ns, context.state)
             if action is not None:
                 self.request = self._out.request(action, self._commanded_ns)
-                self._armed_on_ground |= isinstance(action, Arm)
+                self.armed_on_ground |= isinstance(action, Arm)
 
     def take_answer(self, answer: Answer, now_ns: int) -> str | None:
         """Handle the answer to the pending request. Returns why it failed; None: it did not."""
@@ -218,9 +214,9 @@ class ModeControl:
             ended_in: the state in which the behaviour ended by itself: a vehicle that was armed by us and is
                 still on the ground is disarmed. None: someone else is in command.
         """
-        if ended_in is not None and self._armed_on_ground and ended_in.armed:
+        if ended_in is not None and self.armed_on_ground and ended_in.armed:
             self._disarm = self._out.request(Disarm())
-        self._armed_on_ground = False
+        self.armed_on_ground = False
         self._yielded = self._commanded_ns = None
         self.drop_request()
         self._setpoints.stop()

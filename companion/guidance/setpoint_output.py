@@ -31,6 +31,7 @@ class SetpointOutput:
         sent: the last setpoint after the envelope, or the brake that is streamed while a mode is requested.
         limited_by: names of the limits that changed `sent`.
         path: (north, east) points of the active path around obstacles; empty: none.
+        blind: the vehicle brakes because depth is missing, which was reported.
         altitude_acceptance_m: of the autopilot, how far below its goal it ends a climb; None: not known.
     """
 
@@ -52,7 +53,7 @@ class SetpointOutput:
         self._memory = ObstacleMemory()
         self._avoidance = Avoidance(obstacles.margin_m)
         self._constrained: tuple[BehaviourContext, tuple[Constraint, ...]] | None = None
-        self._blind = False
+        self.blind = False
 
     @property
     def limits(self) -> Limits:
@@ -69,10 +70,6 @@ class SetpointOutput:
         if words:
             self._out.event(EventKind.NOTED, "", words)
 
-    def begin(self) -> None:
-        """A new behaviour begins."""
-        self._blind = False
-
     def activate(self) -> None:
         """The behaviour's first update follows."""
         self._avoidance.reset()
@@ -80,14 +77,6 @@ class SetpointOutput:
     def reset(self) -> None:
         """Our setpoints are active from now on: the envelope starts from the vehicle's own motion."""
         self._envelope.reset()
-
-    def start(self) -> None:
-        """Send setpoints from now on."""
-        self.streaming = True
-
-    def clear_path(self) -> None:
-        """No path around obstacles is active."""
-        self.path = ()
 
     def stop(self) -> None:
         """Send no setpoints any more."""
@@ -154,8 +143,8 @@ class SetpointOutput:
 
     def _report_perception_fault(self, behaviour: str, blind: str | None) -> None:
         """Log once that the vehicle brakes without depth, and once that depth is back."""
-        if (blind is not None) is not self._blind:
-            self._blind = blind is not None
+        if (blind is not None) is not self.blind:
+            self.blind = blind is not None
             if blind is None:
                 self._out.event(EventKind.NOTED, behaviour, "depth is back")
             else:
