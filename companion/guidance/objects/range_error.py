@@ -117,7 +117,8 @@ def depth_sigmas_m(
 ) -> tuple[float, float]:
     """Errors of a horizontal range from depth, and of the straight distance to the point.
 
-    The noise is along the line of sight; the vehicle's height does not matter, its attitude only to the range.
+    The noise is along the line of sight. The vehicle's height does not matter, its attitude only for the
+    range.
 
     Args:
         drop_m: from the lens down to the point.
@@ -153,8 +154,8 @@ def size_sigmas_m(
 ) -> tuple[float, float]:
     """Errors of a horizontal range from the known height of an object, and of the distance to its foot.
 
-    The range is that of `range_from_known_height`. distance = range / cos(depression of the foot), whose error
-    is taken as independent of the range's.
+    The range is that of `range_from_known_height`; distance = range / cos(depression of the foot), whose
+    error is taken as independent of the range's.
 
     Args:
         drop_m: from the lens down to its foot. size_m: the known height.
