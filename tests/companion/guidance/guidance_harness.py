@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from companion.bench.lockstep_flight import vehicle_in_the_air
 from companion.clock import StandstillWatch
@@ -47,6 +47,8 @@ from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObj
 from vision.attitude import quaternion_from_euler
 from vision.obstacle_sectors import ObstacleSectors
 from vision.path_planner import PathRequest
+
+T = TypeVar("T")
 
 CLIMB_MPS = 1.5
 DISARM_AFTER_LANDING_S = 2.0
@@ -417,6 +419,12 @@ def assert_failed(outcome: BehaviourOutput | None, *words: str) -> Outcome:
     assert not outcome.success, outcome.reason
     assert [word for word in words if word not in outcome.reason] == [], outcome.reason
     return outcome
+
+
+def known(value: T | None) -> T:
+    """The value, which is there."""
+    assert value is not None
+    return value
 
 
 def flying(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:

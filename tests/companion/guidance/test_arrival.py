@@ -28,7 +28,7 @@ from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBeha
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.state import Vector3
 from mavlink_sim.lockstep import LockstepVehicle
-from tests.companion.guidance.guidance_harness import assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_succeeded, known
 from vision.attitude import wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 
@@ -108,10 +108,8 @@ def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     chance = random.Random(seed)
     goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
     goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
-    height_m = goto._command.altitude_m
-    assert height_m is not None
-    home = flight.state.home_position_ned_m
-    assert home is not None
+    height_m = known(goto._command.altitude_m)
+    home = known(flight.state.home_position_ned_m)
     outcome, hold = then_hold(flight, goto)
     assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] - height_m), name)
 
@@ -176,12 +174,10 @@ def on_circle(
     orbit = OrbitBehaviour(radius_m, speed_mps, laps, clockwise=bool(seed % 2))
     log = flight.fly(orbit, 150.0)
     assert_succeeded(log.outcome)
-    centre = orbit._centre
-    assert centre is not None
+    centre = known(orbit._centre)
     wide, nose = [], []
     for moment in log.moments:
-        position, yaw_rad = moment.context.state.position_ned_m, moment.context.state.yaw_rad
-        assert position is not None
+        position, yaw_rad = known(moment.context.state.position_ned_m), moment.context.state.yaw_rad
         assert yaw_rad is not None
         if moment.seconds > 8.0:
             wide.append(abs(math.dist(position[:2], centre[:2]) - radius_m))

@@ -29,6 +29,7 @@ from tests.companion.guidance.guidance_harness import (
     assert_succeeded,
     engaged,
     flying,
+    known,
 )
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
 
@@ -295,8 +296,9 @@ def test_lost_track_far_from_all_others_names_none() -> None:
     def each(seconds: float, _vehicle: KinematicVehicle) -> None:
         seen.visible = seconds < 5.0
 
-    outcome = Flight(FollowBehaviour(Follow(Subject(track_id=1))), objects=[seen, other]).run(30.0, each)
-    assert outcome is not None
+    outcome = known(
+        Flight(FollowBehaviour(Follow(Subject(track_id=1))), objects=[seen, other]).run(30.0, each)
+    )
     assert "track 2" not in outcome.reason
 
 
@@ -327,12 +329,10 @@ def test_gimbal_is_kept_on_a_track_until_it_is_lost() -> None:
 
     def off_deg() -> float:
         target = flight.inputs.steering.targets[0]
-        gimbal, yaw_rad = flight.state.gimbal, flight.state.yaw_rad
-        assert gimbal is not None
+        gimbal, yaw_rad = known(flight.state.gimbal), flight.state.yaw_rad
         assert yaw_rad is not None
         wanted = GimbalAim(target.elevation_rad, target.bearing_rad, YawFrame.NORTH)
-        off_rad = gimbal.off_rad(wanted, yaw_rad)
-        assert off_rad is not None
+        off_rad = known(gimbal.off_rad(wanted, yaw_rad))
         return math.degrees(off_rad)
 
     assert off_deg() < 5.0
@@ -357,7 +357,6 @@ def test_mission_step_points_the_gimbal_at_a_track() -> None:
     flight.run(2.0)
     log = flight.fly(PointGimbalBehaviour(Subject(track_id=1)), 15.0, warm_up_s=0.0)
     assert_succeeded(log.outcome)
-    gimbal = flight.state.gimbal
-    assert gimbal is not None
+    gimbal = known(flight.state.gimbal)
     assert gimbal.pitch_rad is not None
     assert math.degrees(gimbal.pitch_rad) == pytest.approx(-20.0, abs=4.0)

@@ -10,6 +10,7 @@ from companion.geometry.fence import Fence
 from companion.guidance.limits.envelope import Envelope, Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
+from tests.companion.guidance.guidance_harness import known
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler, wrap_angle
 
@@ -119,8 +120,7 @@ def test_position_stays_inside_the_altitude_band(position: Vector3, state: Vehic
     sent, _ = Envelope(LIMITS).apply(Setpoint.position(position, NOW), state, NOW, 0.02)
     assert sent.position_ned_m is not None
     north, east, down = sent.position_ned_m
-    here = state.position_ned_m
-    assert here is not None
+    here = known(state.position_ned_m)
     assert math.dist((north, east), here[:2]) <= LIMITS.max_horizontal_speed_mps + 1e-6
     assert -LIMITS.max_climb_mps - 1e-6 <= down - here[2] <= LIMITS.max_descend_mps + 1e-6
 
@@ -189,11 +189,9 @@ def test_landing_ignores_the_minimum_altitude_only() -> None:
     asked = Setpoint.position((0.0, 0.0, 0.0), NOW)
     assert envelope.apply(asked, state, NOW, 0.05, landing=True).sent is asked
     # Only while `landing` is set.
-    velocity = envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps
-    assert velocity is not None
+    velocity = known(envelope.apply(down, state, NOW, 0.05).sent.velocity_ned_mps)
     assert velocity[2] <= 0.0
-    position = envelope.apply(asked, state, NOW, 0.05).sent.position_ned_m
-    assert position is not None
+    position = known(envelope.apply(asked, state, NOW, 0.05).sent.position_ned_m)
     assert position[2] == -LIMITS.min_altitude_m
 
 
@@ -228,8 +226,7 @@ def test_yaw_setpoint_is_rate_limited() -> None:
     headings: list[float] = []
     for _ in range(50):
         asked = Setpoint.velocity((0.0, 0.0, 0.0), NOW, yaw_rad=-3.0)
-        yaw_rad = envelope.apply(asked, vehicle(yaw=3.0), NOW, 0.02).sent.yaw_rad
-        assert yaw_rad is not None
+        yaw_rad = known(envelope.apply(asked, vehicle(yaw=3.0), NOW, 0.02).sent.yaw_rad)
         headings.append(yaw_rad)
     steps = [wrap_angle(b - a) for a, b in zip([3.0, *headings], headings, strict=False)]
     assert all(0 <= step <= 0.02 + 1e-9 for step in steps)

@@ -11,7 +11,7 @@ from pymavlink import mavutil
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, Vector3, VehicleState
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
-from tests.companion.guidance.guidance_harness import assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_succeeded, known
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -31,8 +31,7 @@ def speed_mps(state: VehicleState) -> float:
 
 def off_m(state: VehicleState, north_m: float, east_m: float) -> float:
     """Horizontal distance from a point that is given from home."""
-    home, here = state.home_position_ned_m, state.position_ned_m
-    assert home is not None
+    home, here = known(state.home_position_ned_m), state.position_ned_m
     assert here is not None
     return math.dist(here[:2], (home[0] + north_m, home[1] + east_m))
 
@@ -95,12 +94,10 @@ async def test_goto_and_follow_path_with_the_built_in_vehicle() -> None:
             driver = service.driver
             await service.until(lambda: driver.state.ready_to_arm and driver.state.position_ned_m)
             assert (await service.fly("takeoff 3")).success
-            home = driver.state.home_position_ned_m
-            assert home is not None
+            home = known(driver.state.home_position_ned_m)
 
             outcome = assert_succeeded(await service.fly("goto 6 -3 altitude=5 speed=4"))
-            here = driver.state.position_ned_m
-            assert here is not None
+            here = known(driver.state.position_ned_m)
             north, east, down = here
             assert math.dist((north - home[0], east - home[1], home[2] - down), (6, -3, 5)) < 1.2
 

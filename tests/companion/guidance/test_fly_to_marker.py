@@ -20,7 +20,7 @@ from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air, known
 from vision.camera_model import CameraModel, CameraMount
 
 CAMERA = CameraModel.from_horizontal_fov(480, 360, math.radians(75.0))
@@ -126,22 +126,19 @@ def test_policy_flies_to_the_marker() -> None:
 def test_gimbal_is_kept_on_the_marker() -> None:
     flight = flight_with(lambda _: (10.0, 3.0), rate_hz=5.0, gimbal=True)
     flight.run(1.0)
-    outcome = flight.fly("gimbal marker=7", 12.0).outcome
-    assert outcome is not None
+    outcome = known(flight.fly("gimbal marker=7", 12.0).outcome)
     assert outcome.success, outcome
     off_deg: list[float] = []
 
     def note() -> None:
         north, east, down = np.subtract((10.0, 3.0, -2.2), flight.vehicle.truth.position_ned_m)
-        gimbal = flight.vehicle.vehicle.gimbal
-        assert gimbal is not None
+        gimbal = known(flight.vehicle.vehicle.gimbal)
         w, x, y, z = gimbal.quaternion
         axis = (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
         cosine = np.dot(axis, (north, east, down)) / math.hypot(north, east, down)
         off_deg.append(math.degrees(math.acos(min(1.0, float(cosine)))))
 
-    outcome = flight.fly("goto forward=0 right=5", 30.0, on_tick=note).outcome
-    assert outcome is not None
+    outcome = known(flight.fly("goto forward=0 right=5", 30.0, on_tick=note).outcome)
     assert outcome.success, outcome
     assert np.percentile(off_deg, 95) < 4.0
 

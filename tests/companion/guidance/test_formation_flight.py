@@ -18,6 +18,7 @@ from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
 from companion.guidance.limits.envelope import Limits
 from companion.vehicle.state import FlightMode
+from tests.companion.guidance.guidance_harness import known
 
 GRID = [(0.0, 0.0), (-6.0, -6.0), (-6.0, 0.0), (-6.0, 6.0), (-12.0, 0.0), (-12.0, -6.0), (-12.0, 6.0)]
 
@@ -67,9 +68,7 @@ def slots(fleet: Fleet, name: str) -> dict[str, int]:
 
 
 def ended(fleet: Fleet, name: str) -> Outcome:
-    outcome = fleet.members[name].outcome
-    assert outcome is not None
-    return outcome
+    return known(fleet.members[name].outcome)
 
 
 @pytest.mark.parametrize(
@@ -184,8 +183,7 @@ def test_followers_hold_without_leader_and_resume() -> None:
     fleet.run(3.5)
     for name in "bc":
         member = fleet.members[name]
-        velocity = member.airframe.state.velocity_ned_mps
-        assert velocity is not None
+        velocity = known(member.airframe.state.velocity_ned_mps)
         assert math.hypot(*velocity) < 0.5
         assert member.behaviour is not None
         assert "leader a" in member.behaviour.status
@@ -207,8 +205,7 @@ def test_shape_changes_for_all_and_slots_outlast_their_assigner() -> None:
     fleet.run(1.0)
     assert fleet.run_until(lambda: settled(fleet, "bcd"), 40.0)
     for name in "bcd":
-        behaviour = fleet.members[name].behaviour
-        assert behaviour is not None
+        behaviour = known(fleet.members[name].behaviour)
         assert "line" in behaviour.status
     assert separated(fleet)
     before = slots(fleet, "b")
@@ -236,11 +233,9 @@ def test_impossible_leaders_are_refused() -> None:
     fleet.run(1.0)
     reasons = [member.outcome.reason for member in fleet.members.values() if member.outcome is not None]
     assert any(reason.startswith(("a follows b: ", "b follows a: ")) for reason in reasons)
-    refused = fleet.command("a", FormationBehaviour("line", "a"))
-    assert refused is not None
+    refused = known(fleet.command("a", FormationBehaviour("line", "a")))
     assert "than itself" in refused
-    refused = fleet.command("a", FormationBehaviour("line", "zeus"))
-    assert refused is not None
+    refused = known(fleet.command("a", FormationBehaviour("line", "zeus")))
     assert "of zeus (none received" in refused
 
 

@@ -21,6 +21,7 @@ from companion.guidance.behaviours.formation import FormationBehaviour
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.settings import ZenohSection
 from mavlink_sim.testing import QUICK_FLIGHT, FleetMember, RunningSimulator, free_port, running_simulator
+from tests.companion.guidance.guidance_harness import known
 from tests.companion.live_flight import LiveFlight
 
 pytestmark = pytest.mark.realtime
@@ -111,8 +112,7 @@ async def test_vehicles_share_poses_and_fly_in_formation(vehicles: int) -> None:
             )
             # Positions of the fleet's grid, although each has its own local origin.
             second = next(v for v in leader.neighbourhood().vehicles if v.name == "vehicle2")
-            first_ned_m = leader.driver.state.position_ned_m
-            assert first_ned_m is not None
+            first_ned_m = known(leader.driver.state.position_ned_m)
             assert abs(math.dist(second.position_ned_m[:2], first_ned_m[:2]) - 7.0) < 2.0
 
             refused = await followers[0].command("formation line leader=nobody")
@@ -137,16 +137,14 @@ async def test_vehicles_share_poses_and_fly_in_formation(vehicles: int) -> None:
 
             def role() -> object:
                 now_ns = time.monotonic_ns()
-                pose = leader.poses.pose(leader.driver.state, None, now_ns, in_command=True)
-                assert pose is not None
+                pose = known(leader.poses.pose(leader.driver.state, None, now_ns, in_command=True))
                 return pose_message(pose)["role"]
 
             await until(lambda: role() == "leader")
             least_m: list[float] = []
 
             def watch() -> bool:
-                here = leader.driver.state.position_ned_m
-                assert here is not None
+                here = known(leader.driver.state.position_ned_m)
                 least_m.extend(math.dist(v.position_ned_m, here) for v in leader.neighbourhood().vehicles)
                 return flight.done()
 

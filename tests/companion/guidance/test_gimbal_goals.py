@@ -22,7 +22,7 @@ from companion.guidance.grammar import parse
 from companion.guidance.objects.tracked_object import GlobalPoint, Subject
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.gimbal_flight import PERSON_M, gimbal_flight, person
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, flying
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, flying, known
 
 PLACE: Vector3 = (10.0, 14.0, -1.0)
 # Of the pointing while flying, 95 % of the time and at worst; from the estimated position, which is up to
@@ -32,8 +32,7 @@ USUAL_DEG, WORST_DEG = 1.0, 1.5
 
 def off_deg(flight: LockstepFlight, point: Vector3) -> float:
     """Angle between the true axis of the gimbal and a true position, local NED."""
-    gimbal = flight.vehicle.vehicle.gimbal
-    assert gimbal is not None
+    gimbal = known(flight.vehicle.vehicle.gimbal)
     w, x, y, z = gimbal.quaternion
     axis = np.array((1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)))
     towards = np.subtract(point, flight.vehicle.truth.position_ned_m)
@@ -55,9 +54,7 @@ def answered(flight: LockstepFlight, text: str) -> Outcome:
     """The answer to a gimbal command."""
     identifier = flight.command(text)
     assert flight.run_until(lambda: flight.outcome(identifier), 12.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
-    return outcome
+    return known(flight.outcome(identifier))
 
 
 def kept(flight: LockstepFlight, text: str) -> str:
@@ -88,8 +85,7 @@ def test_gimbal_stays_on_a_place_while_flying(text: str) -> None:
 
     def place() -> Vector3:
         """Where it is by the vehicle's estimate of its own position."""
-        estimate = flight.state.position_ned_m
-        assert estimate is not None
+        estimate = known(flight.state.position_ned_m)
         north, east, down = np.add(PLACE, np.subtract(flight.vehicle.truth.position_ned_m, estimate))
         return (float(north), float(east), float(down))
 
@@ -161,8 +157,7 @@ def test_stop_ends_it_and_the_gimbal_is_released() -> None:
     flight = gimbal_flight(person(20.0, 12.0))
     flight.run(2.0)
     assert kept(flight, place_command(flight, PLACE))
-    manager = flight.vehicle.vehicle.gimbal_manager
-    assert manager is not None
+    manager = known(flight.vehicle.vehicle.gimbal_manager)
     assert manager.primary == (1, 191)
     flight.fly("stop", 5.0)
     (ended,) = [event.message for event in flight.events if event.message.startswith("gimbal: ended ")]
@@ -248,11 +243,10 @@ def test_refused_command_gives_the_reason() -> None:
 )
 def test_place_needs_a_position(changes: dict[str, Any], reason: str) -> None:
     vehicle = flying()
-    known = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
+    located = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
     pointing = Pointing(GlobalPoint(47.0001, 8.0))
-    assert pointing.begin(BehaviourContext(vehicle.now_ns, known)) is None
-    why = pointing.begin(BehaviourContext(vehicle.now_ns, replace(known, **changes)))
-    assert why is not None
+    assert pointing.begin(BehaviourContext(vehicle.now_ns, located)) is None
+    why = known(pointing.begin(BehaviourContext(vehicle.now_ns, replace(located, **changes))))
     assert why.startswith(reason)
 
 
@@ -264,8 +258,7 @@ def test_ranged_object_needs_a_position_and_the_flight_goes_on(
     flight.run(2.0)
     landing = flight.command("land")
     flight.run(1.0)
-    context = flight.guidance.context
-    assert context is not None
+    context = known(flight.guidance.context)
     (seen,) = context.targets
     assert seen.position_ned_m is not None
     stale = replace(flight.state, position_ns=flight.now_ns - 900_000_000)
@@ -277,13 +270,12 @@ def test_ranged_object_needs_a_position_and_the_flight_goes_on(
 
 def test_place_is_given_up_without_a_position() -> None:
     vehicle = flying()
-    known = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
+    located = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
     pointing = Pointing(GlobalPoint(47.0001, 8.0))
-    assert pointing.begin(BehaviourContext(vehicle.now_ns, known)) is None
+    assert pointing.begin(BehaviourContext(vehicle.now_ns, located)) is None
     aim, later_ns = pointing.aim, vehicle.now_ns + round(LOST_AFTER_S * 1e9)
-    assert pointing.update(BehaviourContext(later_ns, known)) is None
+    assert pointing.update(BehaviourContext(later_ns, located)) is None
     assert pointing.aim == aim
-    lost = pointing.update(BehaviourContext(later_ns + 1, known))
-    assert lost is not None
+    lost = known(pointing.update(BehaviourContext(later_ns + 1, located)))
     assert lost.startswith("position lost ")
     assert lost.endswith(" 3.0 s")

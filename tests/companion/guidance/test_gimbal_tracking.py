@@ -30,7 +30,7 @@ from companion.vehicle.mav_result import result_name
 from companion.vehicle.state import VehicleState
 from mavlink_sim.wire.messages import dialect
 from tests.companion.guidance.gimbal_flight import FOOTPRINT, ON_GIMBAL, PERSON_M, gimbal_flight, person
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, known
 from vision.camera_model import CameraMount
 
 MIDDLE_M = PERSON_M[2] / 2
@@ -75,8 +75,7 @@ def off_rad(moment: Moment, scene_object: SceneObject, camera_rad: float = 0.0) 
     """Angle between the camera's axis and the object's true elevation."""
     pose, (north, east, down) = scene_object.pose(moment.seconds), moment.truth.position_ned_m
     range_m = math.hypot(pose.north_m - north, pose.east_m - east)
-    gimbal = moment.context.state.gimbal
-    assert gimbal is not None
+    gimbal = known(moment.context.state.gimbal)
     assert gimbal.pitch_rad is not None
     return abs(gimbal.pitch_rad + camera_rad - math.atan2(down + MIDDLE_M, range_m))
 
@@ -91,8 +90,7 @@ def take_control(flight: LockstepFlight) -> None:
 
 def primary(flight: LockstepFlight) -> tuple[int, int]:
     """The component in primary control."""
-    manager = flight.vehicle.vehicle.gimbal_manager
-    assert manager is not None
+    manager = known(flight.vehicle.vehicle.gimbal_manager)
     who: tuple[int, int] = manager.primary
     return who
 

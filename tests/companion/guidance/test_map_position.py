@@ -23,7 +23,7 @@ from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.world import Ground, World, WorldObject
-from tests.companion.guidance.guidance_harness import assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_succeeded, known
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.marker_boards import Board, locate_board
@@ -120,15 +120,13 @@ def seen_from(
         inside = (pixels > 5).all() and (pixels < (CAMERA.width - 5, CAMERA.height - 5)).all()
         if inside and len(markers) < most:
             noisy = pixels + rng.normal(0.0, CORNER_SIGMA_PX, (4, 2))
-            marker = marker_from_corners(identifier, noisy, SIZE_M, CAMERA)
-            assert marker is not None
+            marker = known(marker_from_corners(identifier, noisy, SIZE_M, CAMERA))
             markers.append(marker)
-    located = locate_board(board, markers, CAMERA)
-    assert located is not None
+    located = known(locate_board(board, markers, CAMERA))
     reported = (euler[0] + rng.normal(0.0, 0.009), euler[1] + rng.normal(0.0, 0.009), 2.0)
-    vision = position_from_map(located, 1000, MOUNT, history_of((0.0, 0.0, 0.0), reported), (0.0, 0.0, 0.0))
-    assert vision is not None
-    return vision
+    return known(
+        position_from_map(located, 1000, MOUNT, history_of((0.0, 0.0, 0.0), reported), (0.0, 0.0, 0.0))
+    )
 
 
 @pytest.mark.parametrize(("most", "allowed_m"), [(1, 0.15), (25, 0.05)])
@@ -150,10 +148,8 @@ def test_position_and_heading_from_a_map_for_any_attitude(board: Board, most: in
 def test_map_that_contradicts_the_tilt_gives_no_position(board: Board) -> None:
     corners = board.corners_m[12]
     pixels = CAMERA.project(corners @ cv2.Rodrigues(np.array([0.9, 0.0, 0.0]))[0].T + [-1.0, 0.5, 3.0])
-    marker = marker_from_corners(12, pixels, SIZE_M, CAMERA)
-    assert marker is not None
-    located = locate_board(board, [marker], CAMERA)
-    assert located is not None
+    marker = known(marker_from_corners(12, pixels, SIZE_M, CAMERA))
+    located = known(locate_board(board, [marker], CAMERA))
     history = history_of((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     assert position_from_map(located, 1000, MOUNT, history, (0.0, 0.0, 0.0)) is None
 

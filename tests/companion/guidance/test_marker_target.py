@@ -14,6 +14,7 @@ from companion.guidance.objects.from_detections import HistoryError, StateHistor
 from companion.guidance.objects.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
 from companion.guidance.objects.pad_filter import PadFilter
 from companion.vehicle.state import Vector3, VehicleState
+from tests.companion.guidance.guidance_harness import known
 from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.camera_model import CameraModel, CameraMount
 from vision.markers import PadMarker, marker_from_corners, square
@@ -51,8 +52,9 @@ def seen(
     ned_from_marker = np.array([[-sine, cosine, 0.0], [cosine, sine, 0.0], [0.0, 0.0, -1.0]])
     corners = square(size_m) @ ned_from_marker.T + (*centre, 0.0)
     pixels = CAMERA.project((corners - eye) @ (ned_from_body @ DOWNWARD.body_from_optical))
-    marker = marker_from_corners(identifier, pixels + (0.0 if noise is None else noise), size_m, CAMERA)
-    assert marker is not None
+    marker = known(
+        marker_from_corners(identifier, pixels + (0.0 if noise is None else noise), size_m, CAMERA)
+    )
     return marker_targets([marker], 1000, DOWNWARD, history, on_pads or {})[0]
 
 
@@ -114,8 +116,9 @@ def test_off_centre_marker_gives_the_pad_position(heading: float, seed: int) -> 
 
 
 def test_without_the_pose_at_capture_there_is_no_target() -> None:
-    marker = marker_from_corners(1, CAMERA.project(square(0.5) * (1, -1, 1) + (0, 0, 3.0)), 0.5, CAMERA)
-    assert marker is not None
+    marker = known(
+        marker_from_corners(1, CAMERA.project(square(0.5) * (1, -1, 1) + (0, 0, 3.0)), 0.5, CAMERA)
+    )
     with pytest.raises(HistoryError, match="no attitude"):
         marker_targets([marker], 1000, DOWNWARD, StateHistory(), {})
     assert marker_targets([], 1000, DOWNWARD, StateHistory(), {}) == ()
@@ -130,11 +133,9 @@ def test_looks_down_needs_nadir_inside_the_image(pitch_deg: float, down: bool) -
 
 def test_missing_marker_detection_is_named() -> None:
     assert "markers.dictionary" in (MarkerSight().unavailable(1.5) or "")
-    nothing = MarkerSight(missing="").unavailable(1.5)
-    assert nothing is not None
+    nothing = known(MarkerSight(missing="").unavailable(1.5))
     assert "none received" in nothing
-    old = MarkerSight((), 1, 2.0, False, "").unavailable(1.5)
-    assert old is not None
+    old = known(MarkerSight((), 1, 2.0, False, "").unavailable(1.5))
     assert "2.0 s old" in old
     assert MarkerSight((), 1, 0.1, True, "").unavailable(1.5) is None
 

@@ -11,6 +11,7 @@ from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import DOUBTED, Target
 from companion.guidance.objects.tracked_object import Subject
+from tests.companion.guidance.guidance_harness import known
 
 HERE = (0.0, 0.0, -4.0)
 CAR, TRACK = Subject("car"), Subject(track_id=1)
@@ -69,8 +70,7 @@ def test_reason_where_nothing_was_chosen(
 ) -> None:
     view = Scene(CAR).show(3.0, *targets, **more)
     assert view.of(CAR) is None
-    why = view.lost(CAR, after_s=2.0)
-    assert why is not None
+    why = known(view.lost(CAR, after_s=2.0))
     assert [word for word in words if word not in why] == []
     assert view.lost(CAR, after_s=5.0) is None
 
@@ -79,22 +79,18 @@ def test_reason_names_where_it_was_and_what_is_near() -> None:
     scene = Scene(TRACK)
     scene.show(2.0, car(9.0), car(9.0, 4.0, 2))
     assert scene.view.lost(TRACK, after_s=0.5) is None
-    why = scene.show(3.0, car(9.0, 4.0, 2)).lost(TRACK, after_s=2.0)
-    assert why is not None
+    why = known(scene.show(3.0, car(9.0, 4.0, 2)).lost(TRACK, after_s=2.0))
     assert why.startswith("lost track 1 for 3.0 s: last seen 9.0 m away; track 2, a car, is 4.0 m")
-    why = scene.show(0.1, fault="camera frozen").lost(TRACK, after_s=2.0)
-    assert why is not None
+    why = known(scene.show(0.1, fault="camera frozen").lost(TRACK, after_s=2.0))
     assert why.endswith(": camera frozen")
 
 
 def test_object_is_chosen_after_a_while_and_kept() -> None:
     scene = Scene(CAR)
     assert scene.show(CHOOSING_S, car(9.0), car(20.0, 1.0, 2)).of(CAR) is None
-    chosen = scene.show(0.1, car(9.0), car(20.0, 1.0, 2)).of(CAR)
-    assert chosen is not None
+    chosen = known(scene.show(0.1, car(9.0), car(20.0, 1.0, 2)).of(CAR))
     assert chosen.track_id == 1
-    kept = scene.show(15.0, car(20.0, 1.0, 2)).of(CAR)
-    assert kept is not None
+    kept = known(scene.show(15.0, car(20.0, 1.0, 2)).of(CAR))
     assert (kept.object_id, kept.occluded) == (chosen.object_id, True)
 
 
@@ -102,7 +98,6 @@ def test_object_without_a_range_gives_a_direction() -> None:
     scene, unranged = Scene(CAR), car(9.0, position_ned_m=None, ground_range_m=float("nan"))
     view = scene.show(1.0, unranged)
     assert view.of(CAR) is None
-    target = view.in_sight(CAR)
-    assert target is not None
+    target = known(view.in_sight(CAR))
     assert target.elevation_rad == unranged.elevation_rad
     assert scene.show(0.1, car(9.0)).of(CAR) is not None

@@ -27,7 +27,7 @@ from companion.service.factory import guidance_options
 from companion.settings.reading import ConfigurationError, load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
-from tests.companion.guidance.guidance_harness import GuidanceHarness
+from tests.companion.guidance.guidance_harness import GuidanceHarness, known
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel, CameraMount
 from vision.obstacle_sectors import SECTORS, ObstacleSectors, obstacle_sectors
@@ -51,16 +51,16 @@ def context(
 
 
 def sent_velocity(harness: GuidanceHarness) -> Vector3:
-    sent = harness.guidance.sent
-    assert sent is not None
+    sent = known(harness.guidance.sent)
     assert sent.velocity_ned_mps is not None
     return sent.velocity_ned_mps
 
 
 def ahead_m(memory: ObstacleMemory, vehicle: KinematicVehicle) -> float:
     """The remembered distance ahead while nothing is seen."""
-    filled = memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle), MARGIN_M).obstacles
-    assert filled is not None
+    filled = known(
+        memory.filled(context(sectors(vehicle.now_ns, rest=NAN), vehicle=vehicle), MARGIN_M).obstacles
+    )
     return filled.distance_m[0]
 
 
@@ -161,8 +161,7 @@ def test_sending_needs_obstacle_sectors() -> None:
 def test_missing_required_depth_is_refused() -> None:
     goto = GotoBehaviour(Goto(forward_m=5.0, right_m=0.0))
     rules = ObstacleRules("required")
-    why = check_requirements(goto, context(None), None, obstacles=rules)
-    assert why is not None
+    why = known(check_requirements(goto, context(None), None, obstacles=rules))
     assert "needs depth" in why
     assert check_requirements(LandBehaviour(), context(None), None, obstacles=rules) is None
     assert (
@@ -211,8 +210,7 @@ def test_obstacles_of_the_map_fill_unseen_directions() -> None:
     vehicle = KinematicVehicle()
     planned = PlannedPath(vehicle.now_ns, (), near=((2.0, 0.0), (0.0, -1.5), (-1.2, 0.0)))
     seen = context(sectors(vehicle.now_ns, {0: 4.0, 1: 5.0}, rest=NAN), vehicle=vehicle)
-    filled = ObstacleMemory().filled(replace(seen, planned=planned), 1.0).obstacles
-    assert filled is not None
+    filled = known(ObstacleMemory().filled(replace(seen, planned=planned), 1.0).obstacles)
     assert filled.distance_m[:2] == (4.0, 5.0)  # as seen now
     assert [filled.distance_m[index] for index in (36, 54)] == pytest.approx([1.2, 1.5])
     assert sum(math.isnan(value) for value in filled.distance_m) == SECTORS - 4

@@ -23,6 +23,7 @@ from companion.guidance.formation.pose import (
     pose_of,
 )
 from companion.vehicle.state import LandedState, VehicleState
+from tests.companion.guidance.guidance_harness import known
 from vision.attitude import quaternion_from_euler
 
 STRUCTURE = Structure((47.4, 8.5, 490.0), (1.0, 0.0, 0.0), 0.1, (47.39, 8.5, 480.0), 12.25, True)
@@ -69,14 +70,12 @@ def test_pose_of_another_program_has_no_command_or_mode() -> None:
 
 
 def test_pose_has_position_and_age() -> None:
-    pose = pose_of(STATE, NOW_NS, vehicle="beta", source="s")
-    assert pose is not None
+    pose = known(pose_of(STATE, NOW_NS, vehicle="beta", source="s"))
     assert (pose.age_s, pose.latitude_deg, pose.altitude_amsl_m) == (0.02, 47.4, 493.0)
     assert pose.heading_rad == pytest.approx(0.7)
     assert pose.turn_rate_radps == pytest.approx(0.3)
     assert pose.airborne
-    parked = pose_of(replace(STATE, armed=False), NOW_NS, vehicle="b", source="s")
-    assert parked is not None
+    parked = known(pose_of(replace(STATE, armed=False), NOW_NS, vehicle="b", source="s"))
     assert not parked.airborne
 
 
@@ -99,8 +98,7 @@ def test_turn_rate_from_body_rates_and_roll() -> None:
         attitude=quaternion_from_euler(math.pi / 6, 0.0, 0.7),
         angular_velocity_frd_radps=(0.0, 0.5 * math.sin(math.pi / 6), 0.5 * math.cos(math.pi / 6)),
     )
-    turning = pose_of(banked, NOW_NS, vehicle="b", source="s")
-    assert turning is not None
+    turning = known(pose_of(banked, NOW_NS, vehicle="b", source="s"))
     assert turning.turn_rate_radps == pytest.approx(0.5)
 
 

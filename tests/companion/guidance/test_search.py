@@ -11,7 +11,7 @@ from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from companion.guidance.objects.target import DOUBTED
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
-from tests.companion.guidance.guidance_harness import Flight, assert_succeeded
+from tests.companion.guidance.guidance_harness import Flight, assert_succeeded, known
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
@@ -88,16 +88,14 @@ def test_search_covers_the_area_and_reports_the_reason() -> None:
         KinematicVehicle(),
         [doubtful],
     )
-    outcome = flight.run(120.0)
-    assert outcome is not None
+    outcome = known(flight.run(120.0))
     assert outcome.reason.endswith(DOUBTED)
 
 
 def test_search_without_footprint_needs_spacing() -> None:
-    outcome = Flight(SearchBehaviour(Seek("car", pattern="square", radius_m=30.0)), KinematicVehicle()).run(
-        1.0
+    outcome = known(
+        Flight(SearchBehaviour(Seek("car", pattern="square", radius_m=30.0)), KinematicVehicle()).run(1.0)
     )
-    assert outcome is not None
     assert outcome.reason.endswith("set spacing")
 
 

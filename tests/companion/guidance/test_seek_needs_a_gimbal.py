@@ -26,6 +26,7 @@ from tests.companion.guidance.guidance_harness import (
     assert_succeeded,
     engaged,
     flying,
+    known,
 )
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import quaternion_from_euler
@@ -103,8 +104,7 @@ NOW_NS = KinematicVehicle().now_ns
 def test_missing_gimbal_requirements_are_named(
     gimbal_state: GimbalState | None, status: GimbalStatus, words: str
 ) -> None:
-    why = check_requirements(seek(), context(gimbal_state, status), None)
-    assert why is not None
+    why = known(check_requirements(seek(), context(gimbal_state, status), None))
     assert words in why
 
 
@@ -126,8 +126,7 @@ def test_unknown_camera_direction_is_refused(
     behaviour: SeekBehaviour | ApproachBehaviour,
 ) -> None:
     status = GimbalStatus(carries_camera=True, direction_fault="no gimbal")
-    why = check_requirements(behaviour, context(None, status), None)
-    assert why is not None
+    why = known(check_requirements(behaviour, context(None, status), None))
     assert "direction (no gimbal)" in why
 
 

@@ -27,7 +27,7 @@ from tests.companion.guidance.gimbal_flight import (
     gimbal_flight,
     person,
 )
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air, known
 
 # Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -68,8 +68,7 @@ def cut_off(target: Target) -> bool:
 def pitches(log: FlightLog) -> list[float]:
     found = []
     for moment in log.moments:
-        gimbal = moment.context.state.gimbal
-        assert gimbal is not None
+        gimbal = known(moment.context.state.gimbal)
         assert gimbal.pitch_rad is not None
         found.append(math.degrees(gimbal.pitch_rad))
     return found
@@ -86,13 +85,11 @@ def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
     # At this elevation 1° of bearing is a third of a degree across.
     assert abs(math.remainder(truth.yaw_rad - bearing, math.tau)) < math.radians(15.0)
     assert pitches(log)[-1] < -50.0, "the gimbal points at the find"
-    position = seen[-1].position_ned_m
-    assert position is not None
+    position = known(seen[-1].position_ned_m)
     assert scene_object.range_m(position, 0.0) < PLACE_BOUND_M
     # Control is released.
     flight.run(1.0)
-    manager = flight.vehicle.vehicle.gimbal_manager
-    assert manager is not None
+    manager = known(flight.vehicle.vehicle.gimbal_manager)
     assert manager.primary == (0, 0)
 
 
@@ -106,8 +103,7 @@ def test_mission_step_holds_until_the_gimbal_points_there() -> None:
     assert "50° down" in mission.records[0].reason
     assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
     # The next step does not use it, so control was released.
-    manager = flight.vehicle.vehicle.gimbal_manager
-    assert manager is not None
+    manager = known(flight.vehicle.vehicle.gimbal_manager)
     assert manager.primary == (0, 0)
 
 

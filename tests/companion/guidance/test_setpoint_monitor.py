@@ -11,6 +11,7 @@ import pytest
 from companion.guidance.limits.setpoint_monitor import REASON, SetpointMonitor
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import LandedState, Vector3, VehicleState
+from tests.companion.guidance.guidance_harness import known
 
 PERIOD_S = 0.03  # LOCAL_POSITION_NED at 33 Hz
 Velocity = Callable[[float], Vector3]
@@ -34,8 +35,7 @@ class Sequence:
         for index in range(round(lasting_s / PERIOD_S)):
             part_s = index * PERIOD_S
             self.seconds += PERIOD_S
-            velocity, position = active(part_s), self.state.position_ned_m
-            assert position is not None
+            velocity, position = active(part_s), known(self.state.position_ned_m)
             north, east, down = (p + v * PERIOD_S for p, v in zip(position, velocity, strict=True))
             self.state = replace(
                 self.state,
@@ -70,31 +70,27 @@ def test_vehicle_stopped_in_flight_is_detected(speed_mps: float, lasting_s: floa
     sequence = Sequence()
     assert sequence.fly(north(speed_mps), north(speed_mps), 5.0) is None
     braking = lambda seconds: (max(0.0, speed_mps - 3.0 * seconds), 0.0, 0.0)  # noqa: E731
-    seen_s = sequence.fly(north(speed_mps), braking, 5.0)
-    assert seen_s is not None
+    seen_s = known(sequence.fly(north(speed_mps), braking, 5.0))
     assert lasting_s <= seen_s <= lasting_s + speed_mps / 3.0 + 0.2
 
 
 @pytest.mark.parametrize(("speed_mps", "at_most_s"), [(1.0, 9.0), (3.0, 4.5)])
 def test_vehicle_that_never_starts_is_detected(speed_mps: float, at_most_s: float) -> None:
-    seen_s = Sequence().fly(north(speed_mps), still, 10.0)
-    assert seen_s is not None
+    seen_s = known(Sequence().fly(north(speed_mps), still, 10.0))
     assert seen_s < at_most_s
 
 
 def test_vehicle_that_leaves_a_hold_is_detected() -> None:
     sequence = Sequence()
     assert sequence.fly(still, still, 5.0) is None
-    seen_s = sequence.fly(still, rising(2.0, 0.6), 5.0)
-    assert seen_s is not None
+    seen_s = known(sequence.fly(still, rising(2.0, 0.6), 5.0))
     assert seen_s < 2.0
 
 
 def test_vehicle_in_another_direction_is_detected() -> None:
     sequence = Sequence()
     assert sequence.fly(north(2.0), north(2.0), 3.0) is None
-    seen_s = sequence.fly(north(2.0), lambda seconds: (0.0, 2.0, 0.0), 5.0)
-    assert seen_s is not None
+    seen_s = known(sequence.fly(north(2.0), lambda seconds: (0.0, 2.0, 0.0), 5.0))
     assert seen_s < 1.5
 
 

@@ -16,7 +16,7 @@ from companion.vehicle.driver import CommandRefusedError
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, known
 
 OLDER = ("1.14", "1.15", "1.16", "1.18")
 
@@ -51,8 +51,7 @@ def held_in_climb(flight: LockstepFlight, wanted_m: float, hold_m: float) -> tup
     assert flight.run_until(lambda: flight.state.mode is FlightMode.HOLD, 5.0)
     short_m = wanted_m - (flight.state.altitude_m or 0.0)
     assert flight.run_until(lambda: flight.outcome(identifier), 60.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
+    outcome = known(flight.outcome(identifier))
     return short_m, outcome
 
 
@@ -117,8 +116,7 @@ def test_pilot_stops_the_rest_of_a_takeoff(after: FlightMode, auto_mode: int, sh
     assert flight.outcome(identifier) is None
     pilot_selects(flight, auto_mode)
     assert flight.run_until(lambda: flight.outcome(identifier), 3.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
+    outcome = known(flight.outcome(identifier))
     assert outcome.reason.startswith("the pilot ")
     assert outcome.reason.endswith(f": {shown.value} mode")
     flight.run(3.0)
@@ -146,8 +144,7 @@ def test_twenty_low_takeoffs_reach_their_height(px4: str) -> None:
             modes.add(flight.state.mode)
             if flight.outcome(identifier) is not None:
                 break
-        outcome = flight.outcome(identifier)
-        assert outcome is not None
+        outcome = known(flight.outcome(identifier))
         assert outcome.success, (number, wanted_m, drift_m, outcome.reason)
         assert flight.state.altitude_m == pytest.approx(wanted_m, abs=0.3)
         assert FlightMode.TAKEOFF not in modes
@@ -163,8 +160,7 @@ def test_estimate_that_moves_at_lift_off_is_not_chased(after_s: float) -> None:
     assert_succeeded(log.outcome)
     standing = 0
     for moment in log.moments:
-        velocity = moment.sent.velocity_ned_mps
-        assert velocity is not None
+        velocity = known(moment.sent.velocity_ned_mps)
         on_ground_now = moment.context.state.landed is LandedState.ON_GROUND
         standing += on_ground_now
         assert math.hypot(*velocity[:2]) <= (0.0 if on_ground_now else SIDEWAYS_MPS + 1e-6)
@@ -183,8 +179,7 @@ def test_pilots_hold_ends_a_low_takeoff_at_any_height(acceptance_m: float | None
         assert before is FlightMode.OFFBOARD
         pilot_selects(flight, 3)
         assert flight.run_until(lambda: flight.outcome(identifier), 5.0)  # noqa: B023
-        outcome = flight.outcome(identifier)
-        assert outcome is not None
+        outcome = known(flight.outcome(identifier))
         assert outcome.reason == PILOT
         flight.run(3.0)
         assert flight.state.mode is FlightMode.HOLD
@@ -203,8 +198,7 @@ def test_takeoff_counts_from_home_as_moved_by_arming(up_m: float) -> None:
     flight = on_ground()
     flight.vehicle.vehicle.faults.begin(f"height_drift {up_m} over=5")
     flight.run(6.0)
-    before_m = flight.state.home_altitude_amsl_m
-    assert before_m is not None
+    before_m = known(flight.state.home_altitude_amsl_m)
     assert flight.state.altitude_m == pytest.approx(up_m, abs=0.1)  # above home as it was
     assert flight.state.landed is LandedState.ON_GROUND
     outcome = assert_succeeded(flight.fly("takeoff 5", 90.0).outcome)

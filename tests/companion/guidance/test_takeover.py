@@ -9,7 +9,7 @@ from companion.guidance.interface import EventKind
 from companion.vehicle.state import FlightMode
 from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.px4.modes import Mode
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, known
 from tests.mavlink_sim.conftest import CALIBRATION
 
 
@@ -40,8 +40,7 @@ def test_endless_command_and_autopilot_mode_say_it_too() -> None:
     flight = flown_by(Mode.POSCTL)
     identifier = flight.command("hold")
     assert flight.run_until(lambda: flight.outcome(identifier), 5.0)
-    outcome = flight.outcome(identifier)
-    assert outcome is not None
+    outcome = known(flight.outcome(identifier))
     assert outcome.reason == "in progress; took over from position mode"
     flight = flown_by(Mode.POSCTL)
     outcome = assert_succeeded(flight.fly("stop", 20.0).outcome)
@@ -51,16 +50,14 @@ def test_endless_command_and_autopilot_mode_say_it_too() -> None:
 def test_only_the_first_command_after_the_pilot_says_it() -> None:
     flight = flown_by(Mode.POSCTL)
     assert flight.fly("goto north=3 east=0", 40.0).outcome is not None
-    outcome = flight.fly("goto north=0 east=0", 40.0).outcome
-    assert outcome is not None
+    outcome = known(flight.fly("goto north=0 east=0", 40.0).outcome)
     assert "took over" not in outcome.reason
     assert len(takeovers(flight)) == 1
 
 
 def test_nobody_is_displaced_in_hold_or_on_the_ground() -> None:
     flight = LockstepFlight.airborne(seed=4)
-    outcome = flight.fly("goto north=3 east=0", 40.0).outcome
-    assert outcome is not None
+    outcome = known(flight.fly("goto north=3 east=0", 40.0).outcome)
     assert "took over" not in outcome.reason
     assert takeovers(flight) == []
 
