@@ -15,7 +15,7 @@ from companion.guidance.objects.from_detections import (
     StateHistory,
     targets_from_detections,
 )
-from companion.guidance.objects.target import RangeSource
+from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.state import Quaternion, Vector3, VehicleState
 from vision.attitude import euler_from_quaternion, quaternion_from_euler, slerp, wrap_angle
 from vision.camera_model import CameraModel, CameraMount, DistortionModel
@@ -73,6 +73,19 @@ def detection(
     return record
 
 
+def localized(
+    *detections: DetectionRecord,
+    camera: CameraModel = CAMERA,
+    mount: CameraMount = MOUNT,
+    history: StateHistory | None = None,
+    heights: dict[str, float] | None = None,
+    at_ns: int = T0,
+) -> tuple[Target, ...]:
+    """The targets of a frame, by default of a level vehicle 8 m above home."""
+    history = history or history_of(quaternion_from_euler(0.0, 0.0, 0.0))
+    return targets_from_detections(detections, at_ns, camera, mount, history, heights or {})
+
+
 def optical_point(
     camera: CameraModel,
     mount: CameraMount,
@@ -88,13 +101,12 @@ def test_only_boxes_where_the_lens_has_no_rays_have_no_target() -> None:
     fisheye = CameraModel(640, 480, 160.0, 160.0, 319.5, 239.5, (0.05, -0.02, 0.0, 0.0), "equidistant")
     boxes = ((300, 300, 360, 340), (0, 0, 60, 40), (130, 60, 190, 100), (575, 0, 635, 40))
     found = [detection(box, nearest=(0.0, 1.0, 8.0)) for box in boxes]
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     assert np.isfinite(fisheye.rays(np.array([(160.0, 80.0)]))).all()
-    targets = targets_from_detections(found, T0, fisheye, MOUNT, history)
+    targets = localized(*found, camera=fisheye)
     assert [target.box_xyxy for target in targets] == [boxes[0], boxes[2]]
     # Its lower edge has no rays, its middle has.
     below = detection((120, 300, 180, 475), nearest=(0.0, 1.0, 8.0))
-    (target,) = targets_from_detections([below], T0, fisheye, MOUNT, history)
+    (target,) = localized(below, camera=fisheye)
     assert math.isfinite(target.range_sigma_m)
     assert math.isfinite(target.across_sigma_m)
 
@@ -107,8 +119,7 @@ def test_target_is_trusted_only_with_a_confirmed_track() -> None:
         {"track_id": 5, "track_score": 0.7, "track_state": "confirmed"},
     ]
     found = [detection((310, 300, 330, 400), **track) for track in tracks]
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
-    targets = targets_from_detections(found, T0, CAMERA, MOUNT, history)
+    targets = localized(*found)
     assert [target.trusted for target in targets] == [True, False, False, True]
     assert [target.track_id for target in targets] == [None, None, 4, 5]
     assert [target.score for target in targets] == [0.8, 0.8, 0.6, 0.7]
@@ -129,8 +140,7 @@ def test_target_is_trusted_only_with_a_confirmed_track() -> None:
 def test_ambiguous_class_is_not_trusted(other: dict[str, Any], trusted: list[bool]) -> None:
     car = detection((310, 300, 330, 400))
     both = [car, detection((311, 300, 331, 400), **other)]
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
-    assert [t.trusted for t in targets_from_detections(both, T0, CAMERA, MOUNT, history)] == trusted
+    assert [t.trusted for t in localized(*both)] == trusted
 
 
 def test_ambiguity_uses_the_track_score() -> None:
@@ -138,8 +148,7 @@ def test_ambiguity_uses_the_track_score() -> None:
     tracks: dict[str, Any] = {"track_state": "confirmed"}
     car = detection(box, track_id=1, track_score=0.9, confidence=0.5, **tracks)
     truck = detection(box, track_id=2, track_score=0.6, confidence=0.8, class_name="truck", **tracks)
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
-    targets = targets_from_detections([car, truck], T0, CAMERA, MOUNT, history)
+    targets = localized(car, truck)
     assert [target.trusted for target in targets] == [True, False]
 
 
@@ -178,7 +187,7 @@ def test_ground_point_is_recovered_from_the_box_foot(camera: CameraModel, scene:
     tall = (x - 9.5, y - 29.5, x + 10.5, y + 0.5)
     small = (x - 0.5, y - 1.5, x + 1.5, y + 0.5)
     boxes = [detection(small), detection(tall)]
-    at_point, target = targets_from_detections(boxes, T0 + 50_000_000, camera, MOUNT, history)
+    at_point, target = localized(*boxes, camera=camera, history=history, at_ns=T0 + 50_000_000)
     assert at_point.position_ned_m is not None
     away = math.dist(point[:2], at_point.position_ned_m[:2])
     assert away == pytest.approx(CONTACT_INSET_M, abs=0.02 * distance)
@@ -204,9 +213,7 @@ def test_point_is_recovered_from_its_depth(scene: Scene, down: float) -> None:
     x, y = CAMERA.project(optical)[0]
     assume(0 < x < 640 and 0 < y < 480)
     box = (x - 11.5, y - 6.5, x + 12.5, y + 7.5)
-    (target,) = targets_from_detections(
-        [detection(box, optical)], T0, CAMERA, MOUNT, history_of(attitude, position)
-    )
+    (target,) = localized(detection(box, optical), history=history_of(attitude, position))
     assert target.range_source is RangeSource.DEPTH
     assert target.position_ned_m == pytest.approx(point, abs=1e-6)
     assert target.ground_range_m == pytest.approx(distance, abs=1e-6)
@@ -217,12 +224,9 @@ def test_point_is_recovered_from_its_depth(scene: Scene, down: float) -> None:
 
 
 def test_position_is_at_the_box_not_the_nearest_corner() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
     # A wall square to the view, 6 m ahead, of which the right half is in the box.
     level = CameraMount()
-    (target,) = targets_from_detections(
-        [detection((420, 200, 520, 280), (0.5, 0.2, 6.0))], T0, CAMERA, level, history
-    )
+    (target,) = localized(detection((420, 200, 520, 280), (0.5, 0.2, 6.0)), mount=level)
     assert target.ground_range_m == pytest.approx(math.hypot(0.5, 6.0))
     bearing = math.atan((469.5 - CAMERA.cx) / CAMERA.fx)
     assert target.bearing_rad == pytest.approx(bearing)
@@ -233,9 +237,8 @@ def test_position_is_at_the_box_not_the_nearest_corner() -> None:
 
 
 def test_position_is_in_the_direction_of_the_middle_by_depth() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0), position=(0.0, 0.0, -8.0))
     seen = detection((420, 200, 520, 280), (0.5, 0.2, 6.0), middle_px=480.0)
-    (target,) = targets_from_detections([seen], T0, CAMERA, CameraMount(), history)
+    (target,) = localized(seen, mount=CameraMount())
     bearing = math.atan((479.5 - CAMERA.cx) / CAMERA.fx)
     assert target.bearing_rad == pytest.approx(bearing)
     assert target.position_ned_m is not None
@@ -244,23 +247,17 @@ def test_position_is_in_the_direction_of_the_middle_by_depth() -> None:
 
 
 def test_box_cut_by_the_edge_has_a_larger_sigma() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
-    whole, cut = targets_from_detections(
-        [detection((10, 300, 60, 400), (-4, 1, 7)), detection((0, 300, 60, 400), (-4, 1, 7))],
-        T0,
-        CAMERA,
-        MOUNT,
-        history,
+    whole, cut = localized(
+        detection((10, 300, 60, 400), (-4, 1, 7)), detection((0, 300, 60, 400), (-4, 1, 7))
     )
     assert cut.range_sigma_m > whole.range_sigma_m + 0.05
     assert (whole.cut, cut.cut) == (False, True)
 
 
 def test_depth_and_distance_have_their_own_sigmas() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     boxes = [detection((310, 200, 330, 300), (0.0, 3.0, 4.0)), detection((310, 300, 330, 400))]
     boxes += [detection((300, 300, 339, 479))]
-    by_depth, by_ground, none = targets_from_detections(boxes, T0, CAMERA, CameraMount(), history)
+    by_depth, by_ground, none = localized(*boxes, mount=CameraMount())
     # 0.07 m and 0.0003 * 4^2.5 m, and 5 m away at a depth of 4 m.
     assert by_depth.depth_sigma_m == pytest.approx(math.hypot(0.07, 0.0096))
     assert by_depth.distance_sigma_m == pytest.approx(1.25 * by_depth.depth_sigma_m)
@@ -275,26 +272,23 @@ def test_depth_and_distance_have_their_own_sigmas() -> None:
 
 
 def test_box_within_the_error_of_its_edges_may_be_cut() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     boxes = [(left, 300, left + 60, 400) for left in (4, CAMERA.width - 64, 10, CAMERA.width - 70)]
-    found = targets_from_detections(list(map(detection, boxes)), T0, CAMERA, MOUNT, history)
+    found = localized(*map(detection, boxes))
     assert [target.cut for target in found] == [True, True, False, False]
     assert not any(target.cut_above for target in found)
 
 
 def test_box_at_the_upper_edge_is_cut_above_only() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     boxes = [detection((300, top, 360, top + 100)) for top in (0, 4, 10)]
-    found = targets_from_detections(boxes, T0, CAMERA, MOUNT, history)
+    found = localized(*boxes)
     assert [target.cut_above for target in found] == [True, True, False]
     assert not any(target.cut for target in found)
 
 
 def test_contact_of_a_wide_box_is_less_known_beside_the_middle() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     boxes = [(CAMERA.width / 2 - half, 300, CAMERA.width / 2 + half, 400) for half in (10, 80)]
     boxes += [(left + 220, top, right + 220, bottom) for left, top, right, bottom in boxes]
-    found = targets_from_detections(list(map(detection, boxes)), T0, CAMERA, MOUNT, history)
+    found = localized(*map(detection, boxes))
     narrow, wide, narrow_beside, wide_beside = [
         target.range_sigma_m / target.ground_range_m**2 for target in found
     ]
@@ -328,7 +322,7 @@ def test_known_height_gives_a_range_without_ground() -> None:
     # 50 px tall, in a camera pitched 20° down, its foot near the horizon.
     box = [300, 50, 320, 100]
     ((without,), (known,), (cut,), (other,)) = (
-        targets_from_detections([detection(where, name=name)], T0, CAMERA, MOUNT, history, heights)
+        localized(detection(where, name=name), history=history, heights=heights)
         for where, name, heights in (
             (box, "person", {}),
             (box, "person", {"person": 1.7}),
@@ -344,15 +338,9 @@ def test_known_height_gives_a_range_without_ground() -> None:
 
 
 def test_ground_and_depth_take_priority_over_known_height() -> None:
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
     heights = {"car": 1.5}
-    (by_ground, by_depth) = targets_from_detections(
-        [detection((310, 300, 330, 400)), detection((10, 300, 30, 400), (-4.0, 1.0, 7.0))],
-        T0,
-        CAMERA,
-        MOUNT,
-        history,
-        heights,
+    (by_ground, by_depth) = localized(
+        detection((310, 300, 330, 400)), detection((10, 300, 30, 400), (-4.0, 1.0, 7.0)), heights=heights
     )
     assert by_ground.range_source is RangeSource.GROUND_PLANE
     assert by_depth.range_source is RangeSource.DEPTH
@@ -360,7 +348,7 @@ def test_ground_and_depth_take_priority_over_known_height() -> None:
 
 def test_box_cut_by_the_lower_edge_has_no_range() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0.7))
-    (target,) = targets_from_detections([detection((300, 300, 339, 479))], T0, CAMERA, MOUNT, history)
+    (target,) = localized(detection((300, 300, 339, 479)), history=history)
     assert target.range_source is RangeSource.NONE
     assert target.position_ned_m is None
     assert math.isnan(target.ground_range_m)
@@ -370,23 +358,18 @@ def test_box_cut_by_the_lower_edge_has_no_range() -> None:
 
 def test_foot_near_the_horizon_has_no_range() -> None:
     level = CameraMount()
-    (target,) = targets_from_detections(
-        [detection((310, 230, 330, 245))], T0, CAMERA, level, history_of(quaternion_from_euler(0, 0, 0))
-    )
+    (target,) = localized(detection((310, 230, 330, 245)), mount=level)
     assert target.range_source is RangeSource.NONE
 
 
 def test_no_ground_plane_range_on_the_ground() -> None:
     history = history_of(quaternion_from_euler(0, 0, 0), (0.0, 0.0, -0.1))
-    (target,) = targets_from_detections([detection((310, 300, 330, 400))], T0, CAMERA, MOUNT, history)
+    (target,) = localized(detection((310, 300, 330, 400)), history=history)
     assert target.range_source is RangeSource.NONE
 
 
 def test_nan_depth_falls_back_to_the_ground() -> None:
-    history = history_of(quaternion_from_euler(0, 0, 0))
-    (target,) = targets_from_detections(
-        [detection((310, 300, 330, 400), (math.nan,) * 3)], T0, CAMERA, MOUNT, history
-    )
+    (target,) = localized(detection((310, 300, 330, 400), (math.nan,) * 3))
     assert target.range_source is RangeSource.GROUND_PLANE
 
 
@@ -396,9 +379,7 @@ def test_attitude_is_that_of_the_capture() -> None:
         yaw = 0.05 * step
         history.add(state_at(T0 + step * 50_000_000, quaternion_from_euler(0, 0, yaw)))
     captured_ns = T0 + 425_000_000  # half way between two samples
-    (target,) = targets_from_detections(
-        [detection((310, 200, 330, 300))], captured_ns, CAMERA, MOUNT, history
-    )
+    (target,) = localized(detection((310, 200, 330, 300)), history=history, at_ns=captured_ns)
     assert target.bearing_rad == pytest.approx(0.425, abs=1e-6)
 
 
@@ -468,8 +449,8 @@ def test_wide_object_in_a_rolled_image_is_ranged_correctly(roll_deg: float) -> N
     box = (*pixels.min(axis=0), *pixels.max(axis=0))
     level = quaternion_from_euler(0.0, 0.0, 0.0)
     history, unrolled = history_of(attitude, (0.0, 0.0, -3.0)), history_of(level, (0.0, 0.0, -3.0))
-    (target,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, history)
-    (plain,) = targets_from_detections([detection(box)], T0, CAMERA, MOUNT, unrolled)
+    (target,) = localized(detection(box), history=history)
+    (plain,) = localized(detection(box), history=unrolled)
     # The ray through the middle of the edge would give 7.9 m.
     assert target.ground_range_m == pytest.approx(10.0 - CONTACT_INSET_M, abs=1.5)
     assert target.range_sigma_m > plain.range_sigma_m + 0.3
@@ -485,10 +466,7 @@ def test_no_number_of_a_target_is_nan_where_a_lens_folds(
 ) -> None:
     camera = CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, coefficients, model)
     boxes = [(x, y, x + 80, y + 60) for x in range(0, 561, 40) for y in range(0, 421, 30)]
-    history = history_of(quaternion_from_euler(0.0, 0.0, 0.0))
-    targets = targets_from_detections(
-        [detection(box) for box in boxes], T0, camera, MOUNT, history, {"car": 1.5}
-    )
+    targets = localized(*map(detection, boxes), camera=camera, heights={"car": 1.5})
     assert 0 < len(targets) < len(boxes)
     ranged = [target for target in targets if target.position_ned_m is not None]
     assert ranged
