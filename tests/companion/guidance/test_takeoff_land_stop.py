@@ -69,9 +69,7 @@ def test_takeoff_completes_a_short_climb() -> None:
 def test_takeoff_times_out_with_the_height_reached() -> None:
     behaviour = TakeoffBehaviour(5.0)
     behaviour.on_activate(context(0))
-    outcome = behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF))
-    assert isinstance(outcome, Outcome)
-    assert_failed(outcome, "0.0 m of 5 m")
+    assert_failed(behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF)), "0.0 m of 5 m")
 
 
 @pytest.mark.parametrize(
@@ -92,9 +90,7 @@ def test_land_and_rtl_end_when_disarmed(
     touched: dict[str, Any] = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
     assert behaviour.update(0.02, context(9, **touched)) == ModeRequest(mode)
     # After disarming PX4 shows the mode from before the landing.
-    outcome = behaviour.update(0.02, context(11, mode=FlightMode.OFFBOARD))
-    assert isinstance(outcome, Outcome)
-    assert_succeeded(outcome, "landed ")
+    outcome = assert_succeeded(behaviour.update(0.02, context(11, mode=FlightMode.OFFBOARD)), "landed ")
     assert outcome.reason.endswith(" and disarmed")
 
 
@@ -152,9 +148,7 @@ def test_landing_on_the_ground_succeeds_at_once(
 ) -> None:
     behaviour = kind()
     behaviour.on_activate(context(0))
-    outcome = behaviour.update(0.0, context(0))
-    assert isinstance(outcome, Outcome)
-    assert_succeeded(outcome, "the ground")
+    assert_succeeded(behaviour.update(0.0, context(0)), "the ground")
 
 
 @pytest.mark.parametrize(("kind", "seconds"), [(LandBehaviour, 60), (ReturnBehaviour, 400)])
@@ -164,9 +158,7 @@ def test_land_and_rtl_time_out_with_the_landed_state(
     behaviour = kind()
     aloft = climbing(5.0, FlightMode.LAND, LandedState.LANDING)
     behaviour.on_activate(context(0, **aloft))
-    outcome = behaviour.update(0.02, context(seconds, **aloft))
-    assert isinstance(outcome, Outcome)
-    assert_failed(outcome, "landing and ", " and armed")
+    assert_failed(behaviour.update(0.02, context(seconds, **aloft)), "landing and ", " and armed")
 
 
 def test_timeout_grows_with_height_and_distance() -> None:
@@ -180,15 +172,11 @@ def test_stop_requests_hold_even_if_it_shows_already() -> None:
     behaviour = StopBehaviour()
     behaviour.on_activate(context(0))
     assert behaviour.update(0.0, context(0)) == ModeRequest(FlightMode.HOLD)
-    outcome = behaviour.update(0.02, context(0.1))
-    assert isinstance(outcome, Outcome)
-    assert outcome.success
+    assert_succeeded(behaviour.update(0.02, context(0.1)))
 
 
 def test_stop_times_out_with_the_current_mode() -> None:
     behaviour = StopBehaviour()
     behaviour.on_activate(context(0))
-    outcome = behaviour.update(0.02, context(6, mode=FlightMode.OFFBOARD))
-    assert isinstance(outcome, Outcome)
-    assert not outcome.success
+    outcome = assert_failed(behaviour.update(0.02, context(6, mode=FlightMode.OFFBOARD)))
     assert outcome.reason.endswith("in 5 s: offboard mode")
