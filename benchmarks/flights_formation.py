@@ -16,7 +16,7 @@ from benchmarks.flights import FlightResult
 from benchmarks.formation import Fleet, LockstepAirframe
 from companion.geometry.formation import SHAPES
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.behaviours.formation import Formation, FormationBehaviour
 from companion.guidance.limits.envelope import Limits
 
 VEHICLES = 5
@@ -54,7 +54,7 @@ def run(seed: int) -> FlightResult:
     shape = SHAPES[seed % len(SHAPES)]
     fleet.run(2.0)
     for name in followers:
-        refused = fleet.command(name, FormationBehaviour(shape, leader, SPACING_M))
+        refused = fleet.command(name, FormationBehaviour(Formation(shape, leader, SPACING_M)))
         if refused is not None:
             return FlightResult(seed, False, {}, f"{name}: {refused}")
     began_s = fleet.now_s

@@ -9,7 +9,6 @@ is not predicted: its followers brake, hold, and end after `lost_timeout_s`.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -36,7 +35,6 @@ from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
 VIRTUAL = "virtual"
-LOST_TIMEOUT_S = 5.0
 # Gain of the position error, 1/s, and the limits of its horizontal and vertical velocity.
 SLOT_GAIN_PER_S = 0.8
 CATCH_UP_MPS = 1.8
@@ -105,32 +103,17 @@ class Formation(Command):
         super().__post_init__()
         if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
             raise GrammarError(f"formation: slot must be auto or 1 to {MOST_SLOTS}, got {self.slot!r}")
-        if (self.leader == "virtual") != (self.points is not None):
+        if (self.leader == VIRTUAL) != (self.points is not None):
             raise GrammarError("formation: give both leader=virtual and points=…, or neither")
         if 0.0 < self.laps < 1.0:
             raise GrammarError(f"formation: laps must be 0, or 1 or more, got {self.laps:g}")
 
     def build(self, context: BuildContext) -> Behaviour:
-        return FormationBehaviour(
-            self.shape,
-            self.leader,
-            self.spacing_m,
-            self.slot_number,
-            points=self.points_m,
-            speed_mps=self.speed_mps,
-            laps=self.laps,
-            lost_timeout_s=self.lost_timeout_s,
-        )
+        return FormationBehaviour(self)
 
 
 class FormationBehaviour(Behaviour):
     """Holds a slot until another command comes, or a virtual structure has flown its path.
-
-    Args:
-        shape: line, column, wedge or circle. leader: a vehicle's name, or "virtual" with points.
-        slot: the requested slot, from 1; None: assigned.
-        points, speed_mps, laps: the path of a virtual structure, as in `follow-path`.
-        lost_timeout_s: how long to wait for the leader's pose.
 
     Attributes:
         note: published to the others; None while inactive.
@@ -140,22 +123,11 @@ class FormationBehaviour(Behaviour):
     name = "formation"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.NEIGHBOURS})
 
-    def __init__(
-        self,
-        shape: str,
-        leader: str,
-        spacing_m: float = 6.0,
-        slot: int | None = None,
-        *,
-        points: Sequence[tuple[float, ...]] = (),
-        speed_mps: float = 2.0,
-        laps: float = 1.0,
-        lost_timeout_s: float = LOST_TIMEOUT_S,
-    ) -> None:
-        self._shape, self.leader_name, self._spacing_m, self._slot = shape, leader, spacing_m, slot
-        self._structure = VirtualStructure(points, speed_mps, laps) if leader == VIRTUAL else None
-        self._lost_timeout_s = lost_timeout_s
-        self.neighbour_names = () if leader == VIRTUAL else (leader,)
+    def __init__(self, command: Formation) -> None:
+        self._command, self._slot, self.leader_name = command, command.slot_number, command.leader
+        path = command.points_m, command.speed_mps, command.laps
+        self._structure = VirtualStructure(*path) if command.leader == VIRTUAL else None
+        self.neighbour_names = (command.leader,) if self._structure is None else ()
         self._reset()
 
     def _reset(self) -> None:
@@ -299,7 +271,8 @@ class FormationBehaviour(Behaviour):
 
     def _agree(self, hood: Neighbourhood, leader: _Leader, position: Vector3) -> Agreement:
         if self._group is None:
-            self._group = Group(hood.own, self.leader_name, self._shape, self._spacing_m, self._slot)
+            shape, spacing_m = self._command.shape, self._command.spacing_m
+            self._group = Group(hood.own, self.leader_name, shape, spacing_m, self._slot)
         self._group.centre_taken = self._centre_taken(hood)
         heading = self._heading_rad or 0.0
         positions = {other.name: _in_frame(other.position_ned_m, leader, heading) for other in hood.vehicles}
@@ -375,7 +348,7 @@ class FormationBehaviour(Behaviour):
 
     def _report_waiting(self, hood: Neighbourhood) -> None:
         """Publish that this vehicle waits: without the leader's pose no slots are assigned."""
-        plan = Plan(0, hood.own, self._shape, self._spacing_m)
+        plan = Plan(0, hood.own, self._command.shape, self._command.spacing_m)
         held = self.note
         self.note = FormationNote(self.leader_name, plan if held is None else held.plan, self._slot)
 
@@ -424,8 +397,8 @@ class FormationBehaviour(Behaviour):
         if self._lost_since_ns is None:
             self._lost_since_ns = now_ns
         lost_s = (now_ns - self._lost_since_ns) / 1e9
-        if lost_s > self._lost_timeout_s:
-            return Outcome(False, f"{why or 'the leader is lost'}; waited for {self._lost_timeout_s:g} s")
+        if lost_s > (most_s := self._command.lost_timeout_s):
+            return Outcome(False, f"{why or 'the leader is lost'}; waited for {most_s:g} s")
         self._words = f"holding: {why}"
         return self._stand(context)
 

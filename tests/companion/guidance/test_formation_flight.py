@@ -12,7 +12,7 @@ from benchmarks.formation import Fleet, PointAirframe
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.formation import FormationBehaviour
+from companion.guidance.behaviours.formation import Formation, FormationBehaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
@@ -39,16 +39,16 @@ def flying(
 
 
 class Options(TypedDict, total=False):
-    """Options of FormationBehaviour."""
+    """Arguments of a formation."""
 
     spacing_m: float
-    slot: int
+    slot: str
     lost_timeout_s: float
 
 
 def follow(fleet: Fleet, names: str, shape: str = "wedge", **options: Unpack[Options]) -> None:
     for name in names:
-        assert fleet.command(name, FormationBehaviour(shape, "a", **options)) is None
+        assert fleet.command(name, FormationBehaviour(Formation(shape, "a", **options))) is None
 
 
 def settled(fleet: Fleet, names: Collection[str], within_m: float = 0.8) -> bool:
@@ -216,36 +216,35 @@ def test_shape_changes_for_all_and_slots_outlast_their_assigner() -> None:
 
 def test_requested_slot_is_assigned_once() -> None:
     fleet = flying(4)
-    follow(fleet, "b", "line", slot=3)
+    follow(fleet, "b", "line", slot="3")
     follow(fleet, "c", "line")
     fleet.run(2.0)
     assert slots(fleet, "b") == {"b": 3, "c": 1}
-    follow(fleet, "d", "line", slot=3)
+    follow(fleet, "d", "line", slot="3")
     fleet.run(2.0)
     assert "taken by b" in ended(fleet, "d").reason
 
 
 def test_impossible_leaders_are_refused() -> None:
     fleet = flying(2)
-    assert fleet.command("b", FormationBehaviour("line", "a")) is None
+    assert fleet.command("b", FormationBehaviour(Formation("line", "a"))) is None
     fleet.run(1.0)
-    assert fleet.command("a", FormationBehaviour("line", "b")) is None
+    assert fleet.command("a", FormationBehaviour(Formation("line", "b"))) is None
     fleet.run(1.0)
     reasons = [member.outcome.reason for member in fleet.members.values() if member.outcome is not None]
     assert any(reason.startswith(("a follows b: ", "b follows a: ")) for reason in reasons)
-    refused = known(fleet.command("a", FormationBehaviour("line", "a")))
+    refused = known(fleet.command("a", FormationBehaviour(Formation("line", "a"))))
     assert "than itself" in refused
-    refused = known(fleet.command("a", FormationBehaviour("line", "zeus")))
+    refused = known(fleet.command("a", FormationBehaviour(Formation("line", "zeus"))))
     assert "of zeus (none received" in refused
 
 
 def test_virtual_structure_flies_its_path_and_ends() -> None:
     fleet = flying(3)
-    points = ((0.0, 0.0), (12.0, 0.0), (12.0, 8.0, 8.0))
+    points = "0,0 12,0 12,8,8"
+    virtual = Formation("line", "virtual", points=points, speed_mps=2.5)
     for name in "abc":
-        assert (
-            fleet.command(name, FormationBehaviour("line", "virtual", points=points, speed_mps=2.5)) is None
-        )
+        assert fleet.command(name, FormationBehaviour(virtual)) is None
     members = fleet.members.values()
     assert fleet.run_until(lambda: all(member.outcome is not None for member in members), 90.0)
     assert all(ended(fleet, name).success for name in fleet.members)
@@ -259,9 +258,9 @@ def test_virtual_structure_flies_its_path_and_ends() -> None:
 
 def test_next_vehicle_takes_over_the_virtual_structure() -> None:
     fleet = flying(3, as_text=True)
-    points = ((0.0, 0.0), (18.0, 0.0))
+    points = "0,0 18,0"
     for name in "abc":
-        fleet.command(name, FormationBehaviour("line", "virtual", points=points))
+        fleet.command(name, FormationBehaviour(Formation("line", "virtual", points=points)))
     fleet.run(8.0)
     fleet.members["a"].muted = fleet.members["a"].deaf = True
     assert fleet.run_until(lambda: all(fleet.members[name].outcome for name in "bc"), 90.0)
@@ -272,7 +271,7 @@ def test_next_vehicle_takes_over_the_virtual_structure() -> None:
 
 def test_hovering_vehicle_is_flown_around() -> None:
     fleet = flying(3, positions=[(0.0, 0.0), (0.0, -30.0), (0.0, -15.0)])
-    assert fleet.command("b", FormationBehaviour("line", "a", slot=2)) is None
+    assert fleet.command("b", FormationBehaviour(Formation("line", "a", slot="2"))) is None
     assert isinstance(fleet.members["c"].behaviour, HoldBehaviour)
     assert fleet.run_until(lambda: settled(fleet, "b"), 40.0)
     assert separated(fleet)
