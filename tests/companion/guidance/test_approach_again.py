@@ -87,8 +87,3 @@ def test_silent_detector_does_not_start_a_search() -> None:
     outcome, notes, _ = active("approach car", SeenObject("car", 40.0, 0.0), each)
     assert "no detections received" in outcome.reason
     assert notes == []
-
-
-def test_retries_must_be_whole() -> None:
-    with pytest.raises(ValueError, match="whole number"):
-        parse("approach car retries=1.5")

@@ -12,8 +12,6 @@ import pytest
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import FlightLog, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
-from companion.guidance.command import NO_CONTEXT, GrammarError
-from companion.guidance.grammar import json_schema, parse
 from companion.guidance.objects.target import UNCONFIRMED_MARKER
 from companion.settings import Settings
 from companion.vehicle.state import Vector3
@@ -173,33 +171,3 @@ def test_marker_needs_detection_with_the_steering_camera() -> None:
     without = LockstepFlight.airborne(seed=1, height_m=HEIGHT_M)
     for command in ("approach marker=7", "follow marker=7", "orbit marker=7"):
         assert_failed(without.fly(command, 5.0).outcome, "(markers.dictionary is not")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("approach marker=7.5", ["marker", "'7.5'"]),
-        ("follow marker=1024", ["marker", "1024", "0 to 1023"]),
-        ("orbit car marker=7", ["class", "marker"]),
-        ("orbit track=3 marker=7", ["track", "marker"]),
-        ("approach car marker=7", ["class", "marker"]),
-        ("follow", ["class or track or marker"]),
-    ],
-)
-def test_bad_commands_name_the_argument(text: str, words: list[str]) -> None:
-    with pytest.raises(GrammarError) as caught:
-        parse(text)
-    assert all(word in str(caught.value) for word in words), caught.value
-
-
-@pytest.mark.parametrize(
-    "text", ["approach marker=0", "follow distance=3 marker=7", "orbit radius=6 marker=7"]
-)
-def test_command_round_trip(text: str) -> None:
-    command = parse(text)
-    assert str(command) == text
-    behaviour = command.build(NO_CONTEXT)
-    assert behaviour.subject is not None
-    assert (behaviour.subject.marker_id, behaviour.subject.class_names) == (int(text[-1]), ())
-    marker = json_schema()["$defs"][text.split()[0]]["properties"]["marker"]
-    assert (marker["type"], marker["minimum"], marker["maximum"]) == ("integer", 0, 1023)

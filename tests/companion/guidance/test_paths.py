@@ -15,9 +15,9 @@ from companion.geometry.geodesy import north_east
 from companion.guidance import grammar
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
-from companion.guidance.behaviours.follow_path import FollowPath, FollowPathBehaviour
+from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
-from companion.guidance.command import NO_CONTEXT, GrammarError
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
@@ -288,47 +288,3 @@ def test_north_east_agrees_with_the_ellipsoid(
     found = north_east((latitude, longitude), there)
     chord = math.dist(earth_centred((latitude, longitude)), earth_centred(there))
     assert math.hypot(*found) == pytest.approx(chord, abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("goto", "exactly one pair"),
-        ("goto 3", "one is missing"),
-        ("goto 3 4 forward=1 right=2", "forward and right"),
-        ("goto 3 99999", "-5000 to 5000"),
-        ("follow-path", "points is missing"),
-        ("follow-path 1,2 3", "'3'"),
-        ("follow-path 1,nan", "'1,nan'"),
-        ("follow-path 1e308,0 1,1", "within 5000 m"),
-        ("follow-path 1,1,-50 1,2", "1 to 500 m high"),
-        ("follow-path 1,1 1,2 laps=0.5", "laps must be 0, or 1 or more"),
-        ("figure-eight radius=1", "3 to 200"),
-    ],
-)
-def test_invalid_commands_are_one_line_errors(text: str, words: str) -> None:
-    with pytest.raises(GrammarError, match=words):
-        grammar.parse(text)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "goto north=10 east=5",
-        "goto altitude=8 forward=5 right=0 heading=90",
-        "goto latitude=47.397742 longitude=8.545594",
-        'follow-path "0,0 10,0,6" laps=0',
-        "figure-eight radius=8 yaw_mode=hold",
-    ],
-)
-def test_commands_round_trip_and_build_a_behaviour(text: str) -> None:
-    command = grammar.parse(text)
-    assert grammar.parse(str(command)) == command
-    assert command.build(NO_CONTEXT).name == command.word
-    assert command.endless == ("laps=0" in text)
-
-
-def test_points_without_quotes() -> None:
-    command = grammar.parse("follow-path 0,0 10,0 10,10,4")
-    assert isinstance(command, FollowPath)
-    assert command.points_m == ((0, 0), (10, 0), (10, 10, 4))

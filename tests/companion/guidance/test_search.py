@@ -97,18 +97,3 @@ def test_search_without_footprint_needs_spacing() -> None:
         Flight(SearchBehaviour(Seek("car", pattern="square", radius_m=30.0)), KinematicVehicle()).run(1.0)
     )
     assert outcome.reason.endswith("set spacing")
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("seek car pattern=square", "pattern=square needs radius"),
-        ("seek car pattern=lawnmower width=10", "needs width and height"),
-        ("seek car radius=10", "pattern=turn does not use radius"),
-        ("seek car pattern=square radius=10 width=3", "does not use width"),
-        ("seek car pattern=zigzag", "square or lawnmower"),
-    ],
-)
-def test_area_arguments_must_fit_the_pattern(text: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        parse(text)
