@@ -6,11 +6,9 @@ import pytest
 from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
-from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
     STEP_S,
     Flight,
-    GuidanceHarness,
     assert_failed,
     assert_succeeded,
 )
@@ -174,16 +172,3 @@ def test_patrol_grammar() -> None:
     assert parse(str(command)) == command
     assert command.build(NO_CONTEXT).class_names == ("person", "car")
     assert command.endless
-
-
-def test_patrol_ends_by_pilot_or_by_a_new_command() -> None:
-    harness = GuidanceHarness(KinematicVehicle(mode=FlightMode.HOLD))
-    harness.run(0.1)
-    future = harness.command(PatrolBehaviour(Patrol(PATH, "car")))
-    harness.until(lambda: harness.vehicle.position[0] > 3.0)
-    harness.autopilot.change_mode(FlightMode.POSITION)
-    harness.until(future.done, 2.0)
-    assert_failed(future.result(), "pilot", "position mode")
-    sent = len(harness.autopilot.setpoints)
-    harness.run(3.0)
-    assert len(harness.autopilot.setpoints) == sent

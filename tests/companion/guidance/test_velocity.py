@@ -13,14 +13,11 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.guidance.behaviour import Behaviour, VelocityInput
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.velocity import VelocityBehaviour
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
-from companion.guidance.mode_control import Phase
 from companion.peer_data import PeerDataError
 from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
-from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     Pending,
@@ -172,27 +169,6 @@ def test_sender_whose_lifetime_is_over_is_replaced() -> None:
     del harness.sending["first"]
     harness.run(0.1)
     assert harness.outcome(harness.command(VelocityBehaviour("second"), endless=True)).success
-
-
-def test_command_is_answered_in_progress_and_ended_by_stop() -> None:
-    harness = Steered()
-    harness.sending["a"] = {"forward_mps": 1.0}
-    harness.run(0.5)
-    assert harness.outcome(harness.command(StopBehaviour())).success
-    assert harness.guidance.phase is Phase.IDLE
-    sent = len(harness.autopilot.setpoints)
-    harness.run(1.0)
-    assert len(harness.autopilot.setpoints) == sent
-
-
-def test_pilot_ends_it_while_messages_arrive() -> None:
-    harness = Steered()
-    harness.sending["a"] = {"forward_mps": 1.0}
-    harness.run(0.5)
-    harness.autopilot.change_mode(FlightMode.POSITION)
-    harness.run(1.0)
-    assert harness.guidance.phase is Phase.IDLE
-    assert harness.outputs[-1].setpoint is None
 
 
 def test_envelope_limits_the_velocity() -> None:
