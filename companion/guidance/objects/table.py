@@ -25,7 +25,8 @@ from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
 # Unseen, the gate grows without bound: a new track id is associated no farther than this from the expected
-# position, plus so much per second; after LONGEST_S only to one that stood, and within STOOD_M of its place.
+# position, plus so much per second in which it was not seen, or only a part of it; after LONGEST_S only to
+# one that stood, and within STOOD_M of its place.
 REACH_M, REACH_MPS, LONGEST_S, STOOD_M = 1.5, 1.0, 10.0, 3.0
 # Of two detections near the expected position one is associated only if it fits better by this factor. Below
 # these squared distances fits count as equal (in general; after an occlusion).
@@ -72,7 +73,7 @@ class _Object:
         self.object_id = object_id
         self.class_name = target.class_name
         self.track_ids: tuple[int, ...] = () if target.track_id is None else (target.track_id,)
-        self.first_ns = self.last_ns = target.captured_ns
+        self.first_ns = self.last_ns = self.shown_ns = target.captured_ns
         self.newest = target
         self.confirmed = target.trusted
         self._frames, self._trusted, self._doubted = 1, int(target.trusted), 0
@@ -103,10 +104,12 @@ class _Object:
     def was_occluded(self, now_ns: int) -> bool:
         return self.unseen_s(now_ns) > max(OCCLUDED_S, OCCLUDED_FRAMES * self.interval_s)
 
-    def see(self, target: Target, *, ambiguous: bool = False) -> None:
+    def see(self, target: Target, *, hidden: bool) -> None:
         """Note a detection of it; its position is the filter's."""
         self._intervals_s.append(self.unseen_s(target.captured_ns))
         self.last_ns, self.newest = target.captured_ns, target
+        if not hidden:
+            self.shown_ns = target.captured_ns
         self.refused = []
         if target.track_id is not None and target.track_id != self.track_id:
             self.track_ids = (*(each for each in self.track_ids if each != target.track_id), target.track_id)
@@ -114,7 +117,7 @@ class _Object:
         self._frames += 1
         self._trusted += target.trusted
         self._doubted += self.confirmed and not target.trusted
-        self.ambiguous = ambiguous or not target.trusted
+        self.ambiguous = not target.trusted
         self._value = None
 
     def value(self, newest_ns: int) -> TrackedObject:
@@ -287,8 +290,7 @@ class _Frame:
         """Whether a detection shows a part of this object, which was seen whole or first of all lately."""
         if id(target) not in self._hidden:
             return False
-        since_ns = known.first_ns if known.filter is None else known.filter.located_ns
-        return self._now_ns - since_ns <= HIDDEN_S * 1e9
+        return self._now_ns - known.shown_ns <= HIDDEN_S * 1e9
 
     def _owner(self, target: Target) -> _Object | None:
         return None if target.track_id is None else self._table._owners.get(target.track_id)
@@ -315,7 +317,7 @@ class _Frame:
         owner = self._owner(target)
         if owner is not None and owner is not known:
             owner.track_ids = tuple(each for each in owner.track_ids if each != target.track_id)
-        known.see(target)
+        known.see(target, hidden=self._partly_hidden(known, target))
         if target.track_id is not None:
             self._table._owners[target.track_id] = known
         self._seen[known.object_id] = target
@@ -374,7 +376,7 @@ class _Frame:
     def _fitting(self, known: _Object) -> list[Fit]:
         """The detections that may be an object which is not seen with its own id, the best fit first."""
         unseen_s = known.unseen_s(self._now_ns)
-        reach_m = REACH_M + REACH_MPS * unseen_s
+        reach_m = REACH_M + REACH_MPS * (self._now_ns - known.shown_ns) / 1e9
         if unseen_s > LONGEST_S:
             assert known.filter is not None
             reach_m = 0.0 if known.filter.moving else STOOD_M

@@ -246,7 +246,7 @@ def test_hidden_lower_edge_leaves_the_object_on_its_way() -> None:
         car = (12.0, SPEED_MPS * (seconds - 2.0))
         far = seen((car[0] + (4.0 if hidden else 0.0), car[1]), vehicle, seconds, 1)
         near = seen((8.0, car[1]), vehicle, seconds, 2)
-        far = replace(far, box_xyxy=(300.0, 200.0, 400.0, 230.0 if hidden else 250.0))
+        far = replace(far, elevation_rad=-0.2, box_xyxy=(300.0, 200.0, 400.0, 230.0 if hidden else 250.0))
         near = replace(near, box_xyxy=(280.0, 225.0, 420.0, 290.0) if hidden else (0.0, 225.0, 140.0, 290.0))
         table.update([far, near], vehicle, far.captured_ns)
         known = table.of_track(1)
@@ -255,3 +255,18 @@ def test_hidden_lower_edge_leaves_the_object_on_its_way() -> None:
         assert not known.occluded
         if seconds > 2.0:
             assert math.dist(known.position_ned_m[:2], car) < 0.5
+
+
+def test_reach_counts_from_when_it_was_seen_whole() -> None:
+    """It turned while a part of it was hidden, and comes back with its id."""
+    table, vehicle = ObjectTable(), (0.0, 0.0, -3.0)
+    for frame in range(44):
+        seconds = frame * FRAME_S
+        hidden = 1.5 < seconds < 3.0
+        near = replace(seen((8.0, 0.0), vehicle, seconds, 2), box_xyxy=(280.0, 225.0, 420.0, 290.0))
+        far = seen((12.0, 3.8 if seconds > 4.0 else 0.0), vehicle, seconds, 1)
+        far = replace(far, elevation_rad=-0.2, box_xyxy=(300.0, 200.0, 400.0, 230.0 if hidden else 220.0))
+        table.update([near] if 3.0 <= seconds <= 4.0 else [far, near], vehicle, near.captured_ns)
+    [far_object, _] = table.objects
+    assert far_object.track_ids == (1,)
+    assert not far_object.occluded
