@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from companion.guidance.objects.estimate import (
     FIRST_VELOCITY_SIGMA_MPS,
     JITTER_M,
+    NEAREST_M,
     RANDOM_WALK_M2_PER_S,
     Estimate,
     Fit,
@@ -38,9 +39,10 @@ MOVING_MPS, MOVING_SIGMA = 1.0, 3.0
 # Or if it was displaced at one of these speeds for so long: a slow detector gives no sure speeds, and a slow
 # object no significant ones.
 DISPLACED = ((1.5, 1.0), (3.0, 0.4))
-# And by one sigma of its position, and at this share of the vehicle's own speed: as it flies, the errors of a
-# standing object's range change.
-OWN_SHARE = 0.4
+# And by one sigma of its position, and by more than the errors of a standing object change as the vehicle
+# flies: most of a range's error has one cause, so that it goes along with the line of sight and its sigma;
+# from another side another point of its surface is seen, off by up to this share of the way across.
+COMMON_SIGMA, ACROSS_SHARE = 1.5, 0.4
 # Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
 MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
 # A detection this many sigma from the fused position shows that the object has moved.
@@ -81,7 +83,7 @@ class PositionFilter:
         self.motion = Estimate.initialize(target, vehicle)
         self.moving, self._cut = False, target.cut
         self._whole_height = 0.0
-        self._was = deque([(target.captured_ns, self.motion.state, vehicle)])
+        self._was = deque([(target.captured_ns, self.motion.state, vehicle, _along(target, vehicle))])
         self._begin_fusion()
         assert target.position_ned_m is not None
         self._fuse(np.array(target.position_ned_m[:2]), _covariance(target, vehicle) + spread)
@@ -128,18 +130,21 @@ class PositionFilter:
 
     def _moves(self, target: Target, vehicle: Vector3) -> bool:
         now_ns, longest_s = target.captured_ns, DISPLACED[-1][0]
-        sigma_m = largest_sigma(_covariance(target, vehicle))
+        along = _along(target, vehicle)
+        sigma_m = math.hypot(*along)
         while len(self._was) > 1 and now_ns - self._was[1][0] >= longest_s * 1e9:
             self._was.popleft()
-        self._was.append((now_ns, self.motion.state, vehicle))
+        self._was.append((now_ns, self.motion.state, vehicle, along))
         for duration_s, speed_mps in DISPLACED:
             before = [was for was in self._was if now_ns - was[0] >= duration_s * 1e9]
             if before:
-                since_ns, then, vehicle_then = before[-1]
+                since_ns, then, vehicle_then, along_then = before[-1]
                 displaced_m = math.hypot(*(self.motion.state - then)[:2])
-                flown_m = math.dist(vehicle[:2], vehicle_then[:2])
-                least_m = max(speed_mps * (now_ns - since_ns) / 1e9, OWN_SHARE * flown_m, sigma_m)
-                if displaced_m > least_m:
+                north, east = vehicle[0] - vehicle_then[0], vehicle[1] - vehicle_then[1]
+                across_m = abs(along[0] * east - along[1] * north) / max(sigma_m, 1e-6)
+                common_m = math.hypot(*(along - along_then))
+                least_m = max(ACROSS_SHARE * across_m, COMMON_SIGMA * common_m, sigma_m)
+                if displaced_m > max(speed_mps * (now_ns - since_ns) / 1e9, least_m):
                     return True
         speed_sigma_mps = math.sqrt(float(np.trace(self.motion.covariance[2:, 2:])))
         return math.hypot(*self.motion.velocity) > max(MOVING_MPS, MOVING_SIGMA * speed_sigma_mps)
@@ -236,6 +241,14 @@ def _covariance(target: Target, vehicle: Vector3) -> NDArray[np.float64]:
         return stated
     assert target.position_ned_m is not None
     return measurement_noise(target, np.array(target.position_ned_m[:2]) - vehicle[:2])
+
+
+def _along(target: Target, vehicle: Vector3) -> NDArray[np.float64]:
+    """(2,) one sigma of a position, along the line of sight."""
+    assert target.position_ned_m is not None
+    towards = np.array(target.position_ned_m[:2]) - vehicle[:2]
+    sigma_m = largest_sigma(_covariance(target, vehicle))
+    return np.asarray(towards * (sigma_m / max(float(np.hypot(*towards)), NEAREST_M)))
 
 
 def _height(target: Target) -> float:

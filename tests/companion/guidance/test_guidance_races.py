@@ -169,7 +169,7 @@ def test_goal_is_discarded_when_someone_else_flies() -> None:
     assert math.dist(harness.vehicle.position, position) < 0.1
 
 
-@pytest.mark.parametrize(("speed_mps", "nearest_m"), [(0.5, 3.9), (0.8, 3.9)])
+@pytest.mark.parametrize(("speed_mps", "nearest_m"), [(0.5, 4.2), (0.8, 4.2)])
 def test_approach_retreats_from_an_approaching_object(speed_mps: float, nearest_m: float) -> None:
     from tests.companion.guidance.guidance_harness import Flight
     from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject

@@ -149,6 +149,20 @@ def test_standing_object_seen_from_a_moving_vehicle_stands() -> None:
     assert not position_of(tracks).moving
 
 
+@pytest.mark.parametrize("speed_mps", [0.0, 0.5])
+def test_only_a_displacement_beyond_the_common_error_is_motion(speed_mps: float) -> None:
+    """The attitude is wrong by its sigma: the error is that of a range by the ground, from 5 m above."""
+    tracks, error_rad = ObjectTable(), 0.06 if speed_mps == 0.0 else 0.01
+    for frame in range(70):
+        vehicle = (0.3 * frame - 32.0, 0.0, -5.0)
+        at = (-0.1 * speed_mps * frame, 0.0)
+        sigma_m = error_rad * (at[0] - vehicle[0]) ** 2 / 5.0
+        target = seen(vehicle, at, frame, sigma_m=sigma_m, along_error_m=sigma_m)
+        tracks.update([target], vehicle, target.captured_ns)
+        if frame >= 60 or speed_mps == 0.0:
+            assert position_of(tracks).moving == (speed_mps > 0.0)
+
+
 @pytest.mark.parametrize("speed_mps", [0.7, 1.2])
 @pytest.mark.parametrize("along", [False, True], ids=["across", "away"])
 def test_ellipse_covers_a_slow_walker(speed_mps: float, along: bool) -> None:
