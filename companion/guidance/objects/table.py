@@ -76,7 +76,7 @@ class _Object:
         self.first_ns = self.last_ns = self.shown_ns = target.captured_ns
         self.newest = target
         self.confirmed = target.trusted
-        self._frames, self._trusted, self._doubted = 1, int(target.trusted), 0
+        self._frames, self._sure, self._doubted = 1, int(target.trusted), 0
         self.ambiguous = False
         located = target.position_ned_m is not None and not hidden
         self.filter = PositionFilter(target, vehicle) if located else None
@@ -114,10 +114,10 @@ class _Object:
         if target.track_id is not None and target.track_id != self.track_id:
             self.track_ids = (*(each for each in self.track_ids if each != target.track_id), target.track_id)
         self.confirmed = self.confirmed or target.trusted
+        self.ambiguous = not target.trusted or target.class_name != self.class_name
         self._frames += 1
-        self._trusted += target.trusted
-        self._doubted += self.confirmed and not target.trusted
-        self.ambiguous = not target.trusted
+        self._sure += not self.ambiguous
+        self._doubted += self.confirmed and self.ambiguous
         self._value = None
 
     def value(self, newest_ns: int) -> TrackedObject:
@@ -143,7 +143,7 @@ class _Object:
             self.confirmed,
             self.ambiguous,
             self._frames,
-            self._doubted / max(1, self._doubted + self._trusted),
+            self._doubted / max(1, self._doubted + self._sure),
             occluded,
             self.newest,
         )

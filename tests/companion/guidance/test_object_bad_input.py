@@ -117,6 +117,12 @@ def test_flipping_class_is_that_of_the_first_frame() -> None:
     assert each.class_name == "car"
 
 
+def test_class_that_flips_for_good_is_in_doubt() -> None:
+    (each,) = fed(lambda frame: [car(HERE, frame, class_name="car" if frame < 10 else "truck")]).objects
+    assert (each.class_name, each.ambiguous, each.certain) == ("car", True, False)
+    assert each.doubt == pytest.approx(20 / 30)
+
+
 @pytest.mark.parametrize("number", [4, 9])
 def test_late_or_repeated_frame_changes_nothing(number: int) -> None:
     table = fed(lambda frame: [car(HERE, frame)], 10)
