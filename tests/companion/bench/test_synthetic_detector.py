@@ -20,20 +20,20 @@ def thing(name: str, size_m: Vector3, north_m: float, east_m: float = 0.0) -> Sc
     return SceneObject(name, size_m, lambda _: ScenePose(north_m, east_m, math.pi / 2))
 
 
-def car_behind(*nearer: SceneObject) -> NDArray[np.float32] | None:
-    """The box of a car 20 m to the north, seen from 3 m above the ground; None: not detected."""
+def cars_behind(*nearer: SceneObject) -> NDArray[np.float32]:
+    """(N, 4) the box of a car 20 m to the north, seen from 3 m above the ground; N = 0: not detected."""
     detector = SyntheticDetector([thing("car", CAR_M, 20.0), *nearer], CAMERA, MOUNT, faults=EXACT)
     found = detector((0.0, 0.0, -3.0), (1.0, 0.0, 0.0, 0.0), 0.0)
-    boxes = found.xyxy[found.class_id == 0]
-    return boxes[0] if len(boxes) else None
+    boxes: NDArray[np.float32] = found.xyxy[found.class_id == 0]
+    return boxes
 
 
-ALONE = car_behind()
+[ALONE] = cars_behind()
 
 
 def test_nothing_before_it_leaves_the_box_whole() -> None:
     for other in (thing("person", (0.5, 0.6, 1.7), 15.0, 9.0), thing("", CAR_M, 26.0)):
-        assert np.array_equal(car_behind(other), ALONE)
+        assert np.array_equal(cars_behind(other), [ALONE])
 
 
 @pytest.mark.parametrize(
@@ -45,17 +45,15 @@ def test_nothing_before_it_leaves_the_box_whole() -> None:
     ],
 )
 def test_nearer_box_over_its_span_moves_one_edge(size_m: Vector3, east_m: float, edge: int) -> None:
-    box = car_behind(thing("", size_m, 14.0, east_m))
-    assert ALONE is not None
-    assert box is not None
+    [box] = cars_behind(thing("", size_m, 14.0, east_m))
     assert np.flatnonzero(box != ALONE).tolist() == [edge]
     middle = (ALONE[edge] + ALONE[edge - 2]) / 2
     assert abs(box[edge] - middle) < abs(ALONE[edge] - middle) - 5.0
 
 
 def test_covered_corner_leaves_the_box_whole() -> None:
-    assert np.array_equal(car_behind(thing("", (2.0, 1.0, 1.2), 14.0, 1.5)), ALONE)
+    assert np.array_equal(cars_behind(thing("", (2.0, 1.0, 1.2), 14.0, 1.5)), [ALONE])
 
 
 def test_mostly_hidden_object_is_not_detected() -> None:
-    assert car_behind(thing("", (8.0, 1.0, 2.0), 14.0)) is None
+    assert not len(cars_behind(thing("", (8.0, 1.0, 2.0), 14.0)))
