@@ -58,7 +58,7 @@ class GimbalStatus:
         direction_fault: why that camera's direction is unknown; empty: it is known, or it has no gimbal.
         controlled_by: another owner of primary control, which is not displaced; empty: none.
         problem: why the gimbal is not moved any more for the active behaviour; empty: it is.
-        camera_pitch_rad: pitch of that camera above the gimbal's axis.
+        camera_pitch_rad: pitch of that camera above the gimbal's axis; 0 if it is not on the gimbal.
     """
 
     carries_camera: bool = False
@@ -151,6 +151,11 @@ class BehaviourContext:
         """Why targets cannot be used, in words; `default` where neither gimbal nor camera is the reason."""
         why = self.gimbal.direction_fault
         return f"camera direction unknown ({why})" if why else self.camera_fault or default
+
+    def gimbal_pitch_to(self, elevation_rad: float) -> float:
+        """The reachable pitch of the gimbal nearest to an elevation of the steering camera's axis."""
+        pitch_rad, gimbal = elevation_rad - self.gimbal.camera_pitch_rad, self.state.gimbal
+        return pitch_rad if gimbal is None else gimbal.nearest_pitch_rad(pitch_rad)
 
     @property
     def neighbours(self) -> tuple[Neighbour, ...]:

@@ -186,8 +186,6 @@ class BehaviourRunner:
             self._modes.decide_alone()
         self._activated, self._position_lost_ns = False, None
         self._setpoints.blind = False
-        self.active, self._landing, self.gimbal_user = None, False, ""
-        self.approached, self.needs = None, frozenset()
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
         """Update the behaviour and act on its output."""

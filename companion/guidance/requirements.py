@@ -80,8 +80,6 @@ def _missing(
                 missing.append(f"home ({fault})")
             case Requirement.PERCEPTION if not _perceiving(context):
                 missing.append(f"perception ({_perception_age(context)})")
-            case Requirement.PERCEPTION if context.gimbal.direction_fault:
-                missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.GIMBAL:
                 missing += missing_gimbal(state, now_ns, context.gimbal, behaviour.gimbal_pitches_rad)
                 seeing = {Requirement.PERCEPTION, Requirement.STEERING_MARKER} & requirements
@@ -96,7 +94,7 @@ def _missing(
                 what := context.steering_markers.unavailable(PERCEPTION_GAP_S)
             ) is not None:
                 missing.append(what)
-            case Requirement.STEERING_MARKER if context.gimbal.direction_fault:
+            case Requirement.PERCEPTION | Requirement.STEERING_MARKER if context.gimbal.direction_fault:
                 missing.append(f"the camera's direction ({context.gimbal.direction_fault})")
             case Requirement.MARKER if (what := context.markers.unavailable(PERCEPTION_GAP_S)) is not None:
                 missing.append(what)

@@ -321,7 +321,8 @@ class SeekBehaviour(Behaviour):
         """Turn nose and gimbal to the find; None: it is lost, and the next best or the turn follows."""
         pitch_off_rad = 0.0
         if self._sweep is not None:
-            pitch_rad, goal_rad = _gimbal_pitch(context), _within_reach(facing.object, context)
+            pitch_rad = _gimbal_pitch(context)
+            goal_rad = context.gimbal_pitch_to(facing.object.detection.elevation_rad)
             self._sweep.towards(goal_rad, dt_s, pitch_rad)
             pitch_off_rad = abs(goal_rad - pitch_rad)
         facing.update(context, pitch_off_rad)
@@ -475,10 +476,3 @@ def _gimbal_pitch(context: BehaviourContext) -> float:
     if gimbal is None or gimbal.pitch_rad is None:
         raise RuntimeError("gimbal attitude unknown: the behaviour must require GIMBAL")
     return gimbal.pitch_rad
-
-
-def _within_reach(found: TrackedObject, context: BehaviourContext) -> float:
-    """The reachable gimbal pitch nearest to an object, radians above the horizon."""
-    gimbal = context.state.gimbal
-    pitch_rad = found.detection.elevation_rad - context.gimbal.camera_pitch_rad
-    return pitch_rad if gimbal is None else gimbal.nearest_pitch_rad(pitch_rad)

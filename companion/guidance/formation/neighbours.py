@@ -11,7 +11,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.geometry.geodesy import north_east
+from companion.geometry.geodesy import latitude_longitude, north_east
 from companion.guidance.formation.pose import FormationNote, Pose, global_problem, pose_from_message, pose_of
 from companion.peer_data import parse_object
 from companion.vehicle.clock_sync import SenderDelay
@@ -140,15 +140,9 @@ class Anchor:
     def globally(self, position: Vector3) -> Vector3:
         """A local position as latitude, longitude (degrees) and height above sea level (metres)."""
         north, east = position[0] - self.position_ned_m[0], position[1] - self.position_ned_m[1]
-        latitude, longitude = self.latitude_deg, self.longitude_deg
-        for _ in range(4):
-            # Newton's method with the local metres per degree: each iteration leaves 1e-5 of the error.
-            off_north, off_east = north_east((self.latitude_deg, self.longitude_deg), (latitude, longitude))
-            per_latitude, _ = north_east((latitude, longitude), (latitude + 1e-3, longitude))
-            _, per_longitude = north_east((latitude, longitude), (latitude, longitude + 1e-3))
-            latitude += (north - off_north) / per_latitude * 1e-3
-            longitude += (east - off_east) / per_longitude * 1e-3
-        return (latitude, longitude, self.altitude_m - (position[2] - self.position_ned_m[2]))
+        here = (self.latitude_deg, self.longitude_deg)
+        altitude_m = self.altitude_m - (position[2] - self.position_ned_m[2])
+        return (*latitude_longitude(here, north, east), altitude_m)
 
 
 @dataclass(slots=True)

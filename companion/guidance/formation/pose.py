@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 from companion.geometry.formation import SHAPES
 from companion.peer_data import PeerDataError
 from companion.vehicle.state import LandedState, VehicleState
+from vision.attitude import euler_from_quaternion
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
 GLOBAL_MAX_AGE_S = 0.5
@@ -189,10 +190,8 @@ def turn_rate(state: VehicleState) -> float:
     """Turn rate of the heading, rad/s clockwise, from body rates, roll and pitch."""
     if state.attitude is None or state.angular_velocity_frd_radps is None:
         return 0.0
-    w, x, y, z = state.attitude
+    roll, pitch, _ = euler_from_quaternion(state.attitude)
     _, pitch_rate, yaw_rate = state.angular_velocity_frd_radps
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     # Bounded near 90° of pitch, where the heading is undefined.
     return (math.sin(roll) * pitch_rate + math.cos(roll) * yaw_rate) / max(0.2, math.cos(pitch))
 

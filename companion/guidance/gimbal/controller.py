@@ -250,20 +250,13 @@ class GimbalController:
         """The gimbal's control and mounting for behaviours. Called first in every step."""
         self._control.own = state.own_address
         owner = self._control.other_owner(state.gimbal)
-        fault = ""
-        if self.mounting.carries_steering:
-            why = (
-                "gimbal manager not responding"
-                if state.gimbal is None
-                else state.gimbal.why_not_looking(now_ns)
-            )
-            fault = "" if why is None else f"its gimbal: {why}"
+        carried, why = self.mounting.carries_steering, _not_looking(now_ns, state)
         return GimbalStatus(
-            self.mounting.carries_steering,
-            fault,
+            carried,
+            f"its gimbal: {why}" if carried and why else "",
             "" if owner is None or self._control.holds(now_ns, state.gimbal) else address_text(owner),
             self._control.problem if self._point is None else "",
-            self.mounting.camera_pitch_rad,
+            self.mounting.camera_pitch_rad if carried else 0.0,
         )
 
     def in_control(self, now_ns: int, state: VehicleState) -> bool:
@@ -381,11 +374,7 @@ class GimbalController:
         self._point = None
 
     def problem(self, now_ns: int, state: VehicleState) -> str:
-        if self._control.problem:
-            return self._control.problem
-        if state.gimbal is None:
-            return "gimbal manager not responding"
-        return state.gimbal.why_not_looking(now_ns) or ""
+        return self._control.problem or _not_looking(now_ns, state)
 
     def _report_problem(self, out: OutputCollector) -> None:
         if self._control.problem != self._reported_problem:
@@ -473,3 +462,10 @@ def direction_text(aim: GimbalAim) -> str:
     if aim.yaw_frame is YawFrame.NORTH:
         return f"{words}, bearing {yaw % 360}°"
     return words if yaw == 0 else f"{words}, {abs(yaw)}° to the {'right' if yaw > 0 else 'left'}"
+
+
+def _not_looking(now_ns: int, state: VehicleState) -> str:
+    """Why the gimbal's direction is unknown, in words; empty: it is known."""
+    if state.gimbal is None:
+        return "gimbal manager not responding"
+    return state.gimbal.why_not_looking(now_ns) or ""

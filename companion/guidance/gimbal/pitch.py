@@ -174,10 +174,8 @@ class GimbalTracking:
         return self.control_fault(context) or self._stuck(context)
 
     def _point_at(self, elevation_rad: float, context: BehaviourContext) -> None:
-        pitch_rad = elevation_rad - context.gimbal.camera_pitch_rad
-        gimbal = context.state.gimbal
-        if gimbal is not None:  # else the gimbal is lost, which is reported
-            self.aim = GimbalAim(gimbal.nearest_pitch_rad(pitch_rad))
+        if context.state.gimbal is not None:  # else the gimbal is lost, which is reported
+            self.aim = GimbalAim(context.gimbal_pitch_to(elevation_rad))
 
     def _stuck(self, context: BehaviourContext) -> str | None:
         """The gimbal lags behind its aim for longer than `PATIENCE_S`, in words; None: it does not."""

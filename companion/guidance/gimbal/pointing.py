@@ -70,10 +70,7 @@ class Pointing:
             return self._lost(context)
         if (towards := self._towards(context)) is not None:
             bearing_rad, elevation_rad = towards
-            pitch_rad = elevation_rad - _camera_pitch_rad(context)
-            if context.state.gimbal is not None:
-                pitch_rad = context.state.gimbal.nearest_pitch_rad(pitch_rad)
-            self.aim = GimbalAim(pitch_rad, bearing_rad, YawFrame.NORTH)
+            self.aim = GimbalAim(context.gimbal_pitch_to(elevation_rad), bearing_rad, YawFrame.NORTH)
         return None
 
     def _look(self, subject: Subject, context: BehaviourContext) -> None:
@@ -110,7 +107,7 @@ class Pointing:
         gimbal, towards = context.state.gimbal, self._towards(context)
         if gimbal is None or towards is None:
             return None
-        pitch_rad = towards[1] - _camera_pitch_rad(context)
+        pitch_rad = towards[1] - context.gimbal.camera_pitch_rad
         if gimbal.reaches(pitch_rad):
             return None
         low, high = math.degrees(gimbal.lowest_pitch_rad), math.degrees(gimbal.highest_pitch_rad)
@@ -142,11 +139,6 @@ class Pointing:
 
 def _position_missing(context: BehaviourContext) -> str:
     return f"position is missing ({context.state.position_fault(context.now_ns)})"
-
-
-def _camera_pitch_rad(context: BehaviourContext) -> float:
-    """Pitch of the steering camera above the gimbal's axis; 0 if it is not on the gimbal."""
-    return context.gimbal.camera_pitch_rad if context.gimbal.carries_camera else 0.0
 
 
 def _position_ahead(state: VehicleState, now_ns: int) -> Vector3 | None:

@@ -91,15 +91,17 @@ class SequenceBehaviour(Behaviour):
         refused: `Guidance.check_requirements`, called at every step.
 
     Attributes:
+        plan: the active plan. current: index of the active step.
         records: the steps that have ended, in order.
+        failure: why the failure handling is active; empty: it is not.
     """
 
     name = "mission"
 
     def __init__(self, plan: Plan, refused: Callable[[Behaviour], str | None]) -> None:
-        self._plan, self._refused = plan, refused
+        self.plan, self._refused = plan, refused
         self.records: list[StepRecord] = []
-        self._at = 0
+        self.current = 0
         self._active: Behaviour | None = None
         # The first step's behaviour declares what the mission needs to begin.
         first = plan.steps[0].make()
@@ -110,7 +112,7 @@ class SequenceBehaviour(Behaviour):
         self._repeats = 0
         self._begun_ns = self._started_ns = 0
         self._request_failure = ""
-        self._failure = ""
+        self.failure = ""
         self._ended = False
         self._goal_ned_m: Vector3 | None = None
         self.later = tuple(step.make() for step in plan.steps)
@@ -122,7 +124,7 @@ class SequenceBehaviour(Behaviour):
             return self._active.needs
         if self._first is None:
             return frozenset()
-        branches = self._plan.steps[0].on_failure != ABORT
+        branches = self.plan.steps[0].on_failure != ABORT
         return self._first.needs - (OF_THE_MOMENT if branches else frozenset())
 
     def blocked_by(self, active: Behaviour, context: BehaviourContext) -> str | None:
@@ -132,30 +134,15 @@ class SequenceBehaviour(Behaviour):
     @property
     def where(self) -> str:
         """The current step: `step 2 of 6 (find)`."""
-        step = self._plan.steps[self._at]
-        if self._failure:
-            return f"descent after {self._failure}"
-        return f"step {self._at + 1} of {len(self._plan.steps)} ({step.title})"
+        step = self.plan.steps[self.current]
+        if self.failure:
+            return f"descent after {self.failure}"
+        return f"step {self.current + 1} of {len(self.plan.steps)} ({step.title})"
 
     @property
     def status(self) -> str:
         doing = "" if self._active is None else f": {self._active.status}"
-        return f"mission {self._plan.name}, {self.where}{doing}"
-
-    @property
-    def plan(self) -> Plan:
-        """The active plan."""
-        return self._plan
-
-    @property
-    def current(self) -> int:
-        """Index of the active step."""
-        return self._at
-
-    @property
-    def failure(self) -> str:
-        """Why the failure handling is active; empty: it is not."""
-        return self._failure
+        return f"mission {self.plan.name}, {self.where}{doing}"
 
     def with_step(self, outcome: Outcome) -> Outcome:
         """Add the current step to an outcome that came from outside (a pilot, another command)."""
@@ -187,9 +174,9 @@ class SequenceBehaviour(Behaviour):
         self._goal_ned_m = context.goal_ned_m
         self.records.clear()
         self._visits.clear()
-        self._request_failure = self._failure = ""
+        self._request_failure = self.failure = ""
         self._ended = False
-        self._at, self._repeats, self._active = 0, 0, None
+        self.current, self._repeats, self._active = 0, 0, None
 
     def on_deactivate(self) -> None:
         self._leave()
@@ -205,8 +192,8 @@ class SequenceBehaviour(Behaviour):
                 return ended
             dt_s = 0.0
         # Steps may end at once; this many in one update are a loop.
-        for _ in range(2 * len(self._plan.steps) + 2):
-            if not self._failure and self._out_of_time(context):
+        for _ in range(2 * len(self.plan.steps) + 2):
+            if not self.failure and self._out_of_time(context):
                 ended = self._give_up(context)
             else:
                 step = self._fly(dt_s, context)
@@ -220,13 +207,13 @@ class SequenceBehaviour(Behaviour):
 
     def _fly(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Update the current step."""
-        active, planned = self._active, self._plan.steps[self._at]
+        active, planned = self._active, self.plan.steps[self.current]
         assert active is not None
         context = replace(context, goal_ned_m=self._goal_ned_m)
         if self._request_failure:
             why, self._request_failure = self._request_failure, ""
             return Outcome(False, why)
-        if not self._failure and (late := self._late(planned, context.now_ns)) is not None:
+        if not self.failure and (late := self._late(planned, context.now_ns)) is not None:
             return late
         try:
             if not self._activated:
@@ -253,19 +240,19 @@ class SequenceBehaviour(Behaviour):
 
     def _after(self, outcome: Outcome, context: BehaviourContext) -> Outcome | None:
         """Start what follows a step that has ended; returns the mission's outcome if nothing does."""
-        planned, where = self._plan.steps[self._at], self.where
+        planned, where = self.plan.steps[self.current], self.where
         self._goal_ned_m = outcome.goal_ned_m
         self._collect_notes()
         self._leave()
-        if self._failure:
-            return Outcome(False, f"{self._failure}; {outcome.reason}")
+        if self.failure:
+            return Outcome(False, f"{self.failure}; {outcome.reason}")
         fields = (planned.title, planned.command, outcome.success, outcome.reason)
         self.records.append(StepRecord(*fields, self._begun_ns, context.now_ns))
         self._repeats += 1
         if outcome.success and self._repeats < planned.repeat:
-            return self._begin(self._at, context, again=True)
+            return self._begin(self.current, context, again=True)
         follows = planned.on_success if outcome.success else planned.on_failure
-        self.add_notes(f"mission {self._plan.name}: {where} {_done(outcome)}{_then(self._plan, follows)}")
+        self.add_notes(f"mission {self.plan.name}: {where} {_done(outcome)}{_then(self.plan, follows)}")
         return self._go_on(follows, f"{where}: {outcome.reason}", context)
 
     def _go_on(self, follows: int | str, reason: str, context: BehaviourContext) -> Outcome | None:
@@ -275,13 +262,13 @@ class SequenceBehaviour(Behaviour):
             return Outcome(True, f"flown, {len(self.records)} steps", self._goal_ned_m)
         if follows == ABORT or context.state.landed is LandedState.ON_GROUND:  # there is no way down
             return Outcome(False, reason)
-        self._failure = reason
-        self._active, self._activated, self._begun_ns = self._plan.way_down(follows), False, context.now_ns
+        self.failure = reason
+        self._active, self._activated, self._begun_ns = self.plan.way_down(follows), False, context.now_ns
         return None
 
     def _begin(self, index: int, context: BehaviourContext, *, again: bool = False) -> Outcome | None:
-        planned = self._plan.steps[index]
-        self._at, self._begun_ns, self._activated = index, context.now_ns, False
+        planned = self.plan.steps[index]
+        self.current, self._begun_ns, self._activated = index, context.now_ns, False
         if not again:
             self._repeats = 0
             self._visits[index] += 1
@@ -290,22 +277,22 @@ class SequenceBehaviour(Behaviour):
                 return self._go_on(_final(planned.on_failure), reason, context)
         self._active, self._first = self._first or planned.make(), None
         times = f", {self._repeats + 1} of {planned.repeat} times" if planned.repeat > 1 else ""
-        number = f"step {index + 1} of {len(self._plan.steps)}"
-        self.add_notes(f"mission {self._plan.name}: {number}{times}: {planned.command}")
+        number = f"step {index + 1} of {len(self.plan.steps)}"
+        self.add_notes(f"mission {self.plan.name}: {number}{times}: {planned.command}")
         return None
 
     def _out_of_time(self, context: BehaviourContext) -> bool:
-        limit_s = self._plan.timeout_s
+        limit_s = self.plan.timeout_s
         return limit_s is not None and context.now_ns - self._started_ns > limit_s * 1e9
 
     def _give_up(self, context: BehaviourContext) -> Outcome | None:
         """The mission's time-out has passed: the current step fails."""
-        reason = f"{self.where}: mission timed out after {self._plan.timeout_s:g} s"
+        reason = f"{self.where}: mission timed out after {self.plan.timeout_s:g} s"
         self._goal_ned_m = None
         self._collect_notes()
         self._leave()
-        self.add_notes(f"mission {self._plan.name}: {reason}")
-        return self._go_on(_final(self._plan.steps[self._at].on_failure), reason, context)
+        self.add_notes(f"mission {self.plan.name}: {reason}")
+        return self._go_on(_final(self.plan.steps[self.current].on_failure), reason, context)
 
     def _collect_notes(self) -> None:
         if self._active is not None:
