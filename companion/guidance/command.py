@@ -232,6 +232,7 @@ class Command(ABC):
         word: name in the grammar. help: one line.
         takes_attachment: further lines may be sent along.
         renamed: former key of an argument → its current key, for the error message.
+        endless_without: field of which 0 means: until another command; empty: none has such a value.
         stated: names of parts that were asked for: the text has them also where they equal their default.
 
     >>> from companion import Behaviour, BuildContext, Command
@@ -247,6 +248,7 @@ class Command(ABC):
     help: ClassVar[str]
     takes_attachment: ClassVar[bool] = False
     renamed: ClassVar[Mapping[str, str]] = {}
+    endless_without: ClassVar[str] = ""
     stated: ClassVar[frozenset[str]] = frozenset()
 
     def __post_init__(self) -> None:
@@ -266,7 +268,7 @@ class Command(ABC):
     @property
     def endless(self) -> bool:
         """Whether it runs until another command comes."""
-        return False
+        return bool(self.endless_without) and not getattr(self, self.endless_without)
 
     @property
     def aim(self) -> GimbalGoal | None:

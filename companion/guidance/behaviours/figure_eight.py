@@ -19,16 +19,13 @@ _POINTS = 96
 @behaviour("figure-eight", "fly a level eight about the current position, first towards the nose")
 class FigureEight(Command):
     renamed: ClassVar[Mapping[str, str]] = {"nose": "yaw_mode"}
+    endless_without = "laps"
     radius_m: Annotated[float, Number("radius", "m", 3.0, 200.0, "from its centre to either end")] = 10.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.2, 20.0, "maximum speed; bends are slower")] = 2.0
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 1.0
     yaw_mode: Annotated[
         str, EnumArgument("yaw_mode", ("path", "hold"), "yaw: along the path, or unchanged")
     ] = "path"
-
-    @property
-    def endless(self) -> bool:
-        return self.laps == 0.0
 
     def build(self, context: BuildContext) -> Behaviour:
         along = self.yaw_mode == "path"

@@ -45,6 +45,7 @@ UNSEEN_S = 0.6
 
 @behaviour("follow", "keep a distance and a bearing to a moving object of the class, a track or a marker")
 class Follow(Command):
+    endless_without = "duration_s"
     subject: Subject
     distance_m: Annotated[
         float, Number("distance", "m", 1.5, 100.0, "to keep, over ground to its nearest surface")
@@ -76,10 +77,6 @@ class Follow(Command):
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
     gimbal: GimbalUse = "leave"
-
-    @property
-    def endless(self) -> bool:
-        return self.duration_s == 0.0
 
     def build(self, context: BuildContext) -> Behaviour:
         return FollowBehaviour(self)

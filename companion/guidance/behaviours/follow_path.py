@@ -25,6 +25,7 @@ from companion.vehicle.state import Vector3
 @behaviour("follow-path", "fly along a list of points, slowing down for corners")
 class FollowPath(Command):
     renamed: ClassVar[Mapping[str, str]] = {"nose": "yaw_mode"}
+    endless_without = "laps"
     points: Annotated[
         str, Points("points", 'north,east or north,east,height, metres from home: "0,0 10,0,5 10,10"')
     ]
@@ -34,23 +35,14 @@ class FollowPath(Command):
         str, EnumArgument("yaw_mode", ("path", "hold"), "yaw: along the path, or unchanged")
     ] = "path"
 
-    @property
-    def endless(self) -> bool:
-        return self.laps == 0.0
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if 0.0 < self.laps < 1.0:
             raise GrammarError(f"follow-path: laps must be 0, or 1 or more, got {self.laps:g}")
 
-    @property
-    def points_m(self) -> tuple[tuple[float, ...], ...]:
-        """(north, east) or (north, east, height) of each point, metres from home."""
-        return points_from(self.points)
-
     def build(self, context: BuildContext) -> Behaviour:
         along = self.yaw_mode == "path"
-        return FollowPathBehaviour(self.points_m, self.speed_mps, laps=self.laps, nose_along=along)
+        return FollowPathBehaviour(points_from(self.points), self.speed_mps, laps=self.laps, nose_along=along)
 
 
 class FollowPathBehaviour(PathFlight):

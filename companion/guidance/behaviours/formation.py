@@ -94,11 +94,6 @@ class Formation(Command):
         """None: auto."""
         return None if self.slot == "auto" else int(self.slot)
 
-    @property
-    def points_m(self) -> tuple[tuple[float, ...], ...]:
-        """(north, east) or (north, east, height) of each point of the path, metres from home."""
-        return points_from(self.points or "")
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.slot != "auto" and not (self.slot.isdecimal() and 1 <= int(self.slot) <= MOST_SLOTS):
@@ -125,7 +120,7 @@ class FormationBehaviour(Behaviour):
 
     def __init__(self, command: Formation) -> None:
         self._command, self._slot, self.leader_name = command, command.slot_number, command.leader
-        path = command.points_m, command.speed_mps, command.laps
+        path = points_from(command.points or ""), command.speed_mps, command.laps
         self._structure = VirtualStructure(*path) if command.leader == VIRTUAL else None
         self.neighbour_names = (command.leader,) if self._structure is None else ()
         self._reset()

@@ -28,13 +28,10 @@ GOAL_NEAR_M = 1.0
 
 @behaviour("hold", "hold the current position by setpoints")
 class Hold(Command):
+    endless_without = "duration_s"
     duration_s: Annotated[
         float, Number("duration", "s", 0.0, 3600.0, "how long; 0: until another command")
     ] = 0.0
-
-    @property
-    def endless(self) -> bool:
-        return self.duration_s == 0.0
 
     def build(self, context: BuildContext) -> Behaviour:
         return HoldBehaviour(self.duration_s)

@@ -74,6 +74,7 @@ MAX_CENTRIPETAL_MPS2 = 2.0
     "orbit", "circle, nose to the centre: the point `radius` ahead, an object of a class, a track or a marker"
 )
 class Orbit(Command):
+    endless_without = "laps"
     subject: Subject | None = None
     radius_m: Annotated[float, Number("radius", "m", 1.0, 100.0, "of the circle")] = 10.0
     speed_mps: Annotated[float, Number("speed", "m/s", 0.1, 10.0, "along the circle")] = 2.0
@@ -81,10 +82,6 @@ class Orbit(Command):
     direction: Annotated[
         str, EnumArgument("direction", ("clockwise", "counterclockwise"), "seen from above")
     ] = "clockwise"
-
-    @property
-    def endless(self) -> bool:
-        return self.laps == 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -49,6 +49,7 @@ class Patrol(Command):
         "again": "revisit",
         "apart": "merge_radius",
     }
+    endless_without = "laps"
     points: Annotated[str, Points("points", "the path: north,east or north,east,height, metres from home")]
     class_names: Annotated[str, ClassNames("classes", "what to stop for, separated by commas")]
     on_detection: Annotated[
@@ -76,19 +77,10 @@ class Patrol(Command):
     laps: Annotated[float, Number("laps", "", 0.0, 1000.0, "how many; 0: until another command")] = 0.0
     confidence: Annotated[float, Number("confidence", "", 0.05, 1.0, "minimum confidence")] = 0.4
 
-    @property
-    def endless(self) -> bool:
-        return self.laps == 0.0
-
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.points_m) < 2:
-            raise GrammarError(f"patrol: points must be at least 2 points, got {len(self.points_m)}")
-
-    @property
-    def points_m(self) -> tuple[tuple[float, ...], ...]:
-        """(north, east) or (north, east, height) of each point, metres from home."""
-        return points_from(self.points)
+        if (count := len(points_from(self.points))) < 2:
+            raise GrammarError(f"patrol: points must be at least 2 points, got {count}")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -112,7 +104,7 @@ class PatrolBehaviour(Behaviour):
         if self._approaches:
             self.requirements = PatrolBehaviour.requirements | {Requirement.DEPTH_OR_SIZE}
         self._route = FollowPathBehaviour(
-            command.points_m, command.speed_mps, laps=command.laps, round_trip=True
+            points_from(command.points), command.speed_mps, laps=command.laps, round_trip=True
         )
         self._begin(0)
 

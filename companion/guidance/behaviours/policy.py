@@ -70,7 +70,7 @@ class Policy(Command):
                     f"{loaded.name} steps at {rate_hz:g} Hz, guidance only at {loop_hz:g} Hz: "
                     "set guidance.rate_hz to at least that of the policy"
                 )
-            return PolicyBehaviour(loaded, self.subject, distance_m=self.distance_m, limit_s=self.limit_s)
+            return PolicyBehaviour(self, loaded)
         except PolicyError as error:
             raise GrammarError(f"policy: {error}") from error
 
@@ -107,7 +107,6 @@ class PolicyBehaviour(Behaviour):
 
     Args:
         policy: checked by `check_quantities`.
-        subject: the object. distance_m: where to stop, over ground to its surface. limit_s: longest duration.
 
     Raises:
         PolicyError: it was not trained for this distance.
@@ -116,27 +115,27 @@ class PolicyBehaviour(Behaviour):
     name = "policy"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
-    def __init__(self, policy: LoadedPolicy, subject: Subject, *, distance_m: float, limit_s: float) -> None:
-        self._policy = policy
-        self.subject: Subject = subject
-        self._distance_m, self._limit_s = distance_m, limit_s
+    def __init__(self, command: Policy, policy: LoadedPolicy) -> None:
+        self._command, self._policy = command, policy
+        self.subject: Subject = command.subject
         trained = next(q for q in policy.description.observation if q.name == "distance_wanted_m")
-        if not trained.low <= distance_m <= trained.high:
+        if not trained.low <= command.distance_m <= trained.high:
             raise PolicyError(
-                f"{policy.name} was trained for a distance of {trained.allowed}, not {distance_m:g} m"
+                f"{policy.name} was trained for a distance of {trained.allowed}, not {command.distance_m:g} m"
             )
+        self._begin(0)
+
+    def _begin(self, now_ns: int) -> None:
         self._arrival = Arrival()
         self._object: TrackedObject | None = None
         self._hold: HoldBehaviour | None = None
         self._action = dict.fromkeys(ACTIONS, 0.0)
-        self._begun_ns = self._due_ns = 0
+        self._begun_ns = self._due_ns = now_ns
         self._range_m = math.nan
 
     def on_activate(self, context: BehaviourContext) -> None:
-        self._arrival = Arrival()
-        self._object = self._hold = None
+        self._begin(context.now_ns)
         context.objects.forget(self.subject)
-        self._begun_ns = self._due_ns = context.now_ns
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         position, yaw_rad = position_and_yaw(context.state)
@@ -148,11 +147,11 @@ class PolicyBehaviour(Behaviour):
             return self._wait(dt_s, context)
         values = self._observation(seen, context, position, yaw_rad)
         self._range_m = math.hypot(values["target_forward_m"], values["target_right_m"])
-        at_m = abs(self._range_m - self._distance_m)
+        at_m = abs(self._range_m - self._command.distance_m)
         lost = values["target_age_s"] > LOST_AFTER_S
         if not lost and self._arrival.update(at_m, speed_of(context.state), context.now_ns):
             return Outcome(True, f"reached {self.subject.name} at {self._range_m:.1f} m")
-        if elapsed_s > self._limit_s:
+        if elapsed_s > self._command.limit_s:
             return Outcome(False, f"not there after {elapsed_s:.0f} s: {self._range_m:.1f} m away")
         if (fault := self._untrained(values)) is not None:
             why = context.perception_fault("")
@@ -187,7 +186,7 @@ class PolicyBehaviour(Behaviour):
         forward_mps, right_mps = _rotated(north_mps, east_mps, -yaw_rad)
         age_s = seen.unseen_s(context.now_ns)
         values = (target_forward, target_right, -down, forward_mps, right_mps, -down_mps, age_s)
-        return dict(zip(OBSERVATIONS, (*values, self._distance_m), strict=True))
+        return dict(zip(OBSERVATIONS, (*values, self._command.distance_m), strict=True))
 
     def _untrained(self, values: dict[str, float]) -> str | None:
         """Which value the policy was not trained for; None: none."""
