@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import vision.detector  # noqa: F401  (registers its kinds of detectors)
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.grammar import describe, json_schema, markdown, parse
 from companion.plugins import PluginError, load_plugins
