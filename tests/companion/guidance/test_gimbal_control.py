@@ -46,6 +46,12 @@ class Bench:
         self.answer()
         assert self.control.held
 
+    def denied(self) -> None:
+        """We have had control, and the next aim is denied."""
+        self.held()
+        assert self.turn(LEVEL) == PointGimbal(LEVEL)
+        self.answer("denied")
+
 
 def test_control_is_taken_pointed_and_released() -> None:
     bench = Bench()
@@ -127,9 +133,7 @@ def test_stale_status_is_not_a_loss_of_control() -> None:
 def test_after_a_denial_it_is_released_only_if_ours() -> None:
     for shown, asked in ((STATION, None), (AUTOPILOT, None), (OURS, GIVE_BACK)):
         bench = Bench()
-        bench.held()
-        assert bench.turn(LEVEL) == PointGimbal(LEVEL)
-        bench.answer("denied")
+        bench.denied()
         assert bench.control.problem == "denied"
         assert bench.turn(LEVEL) is None, "owner not known yet"
         bench.shows(shown)
@@ -144,27 +148,18 @@ def test_refused_control_is_not_requested_again() -> None:
     assert [bench.turn(DOWN) for _ in range(30)] == [None] * 30
 
 
-def test_after_a_denial_a_new_owner_requests_control() -> None:
-    bench = Bench()
-    bench.held()
-    assert bench.turn(LEVEL) == PointGimbal(LEVEL)
-    bench.answer("denied")
-    another = object()
+@pytest.mark.parametrize(
+    ("shown", "request_", "problem"), [(NOBODY, TAKE, ""), (STATION, None, "245/190 has primary control")]
+)
+def test_after_a_denial_a_new_owner_requests_only_free_control(
+    shown: tuple[int, int], request_: GimbalRequest | None, problem: str
+) -> None:
+    bench, another = Bench(), object()
+    bench.denied()
     assert bench.turn(DOWN, another) is None, "owner not known yet"
-    bench.shows(NOBODY)
-    assert bench.turn(DOWN, another) == TAKE
-
-
-def test_after_a_denial_the_actual_owner_keeps_control() -> None:
-    bench = Bench()
-    bench.held()
-    assert bench.turn(LEVEL) == PointGimbal(LEVEL)
-    bench.answer("denied")
-    another = object()
-    assert bench.turn(DOWN, another) is None
-    bench.shows(STATION)
-    assert bench.turn(DOWN, another) is None
-    assert bench.control.problem.startswith("245/190 has")
+    bench.shows(shown)
+    assert bench.turn(DOWN, another) == request_
+    assert bench.control.problem == problem
 
 
 def test_after_a_denial_without_status_it_is_not_taken() -> None:

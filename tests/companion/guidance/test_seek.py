@@ -1,11 +1,12 @@
 import math
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
-from companion.guidance.behaviour import Outcome
+from companion.guidance.behaviour import Behaviour, Outcome
 from companion.guidance.behaviours.seek import Seek, SeekBehaviour
-from companion.guidance.command import NO_CONTEXT
+from companion.guidance.command import NO_CONTEXT, BuildContext
 from companion.guidance.grammar import parse
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
@@ -15,8 +16,7 @@ from vision.attitude import wrap_angle
 def found(
     flight: Flight, each: Callable[[float, KinematicVehicle], None] = lambda seconds, vehicle: None
 ) -> Outcome:
-    outcome = assert_succeeded(flight.run(90.0, each))
-    return outcome
+    return assert_succeeded(flight.run(90.0, each))
 
 
 @pytest.mark.parametrize("degrees", [0, 30, 90, 179, 200, 300, 355])
@@ -101,38 +101,40 @@ def faces(vehicle: KinematicVehicle, scene_object: SeenObject) -> bool:
     ) < math.radians(5)
 
 
-def test_command_compares_the_finds_of_a_whole_turn() -> None:
-    first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
-    surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
+def car(north: float, east: float, score: float | None = None, **changes: Any) -> SeenObject:
+    """A car; with a score, it is a track."""
+    track_id = None if score is None else int(abs(north + east))
+    return SeenObject("car", north, east, track_id=track_id, track_score=score, **changes)
+
+
+# Of the two finds, the second is faced.
+BEST = {
+    "surest of a whole turn": (parse("seek car").build, car(20.0, 6.0, 0.5), car(-15.0, 9.0, 0.85)),
+    "first": (lambda _: SeekBehaviour(Seek("car")), car(-15.0, 9.0, 0.85), car(20.0, 6.0, 0.5)),
+    "nearest of the equally sure": (lambda _: whole_turn(), car(34.0, 12.0, 0.85), car(-15.0, 9.0, 0.8)),
+    "by track, not frame": (
+        lambda _: whole_turn(),
+        car(20.0, 0.0, 0.45, confidence=0.9),
+        car(20.0, 9.0, 0.8),
+    ),
+    "of a part of a turn": (lambda _: whole_turn(0.5), car(0.0, -15.0, 0.9), car(0.0, 15.0, 0.6)),
+    "without tracks": (lambda _: whole_turn(), car(34.0, 12.0, confidence=0.5), car(-15.0, 9.0)),
+    "without ranges": (
+        lambda _: whole_turn(),
+        car(34.0, 12.0, confidence=0.5, with_range=False),
+        car(-15.0, 9.0, with_range=False),
+    ),
+}
+
+
+@pytest.mark.parametrize(("build", "other", "best"), BEST.values(), ids=BEST)
+def test_best_find_is_faced(
+    build: Callable[[BuildContext], Behaviour], other: SeenObject, best: SeenObject
+) -> None:
     vehicle = KinematicVehicle()
-    found(Flight(parse("seek car").build(NO_CONTEXT), vehicle, [first, surer]))
-    assert faces(vehicle, surer)
+    found(Flight(build(NO_CONTEXT), vehicle, [other, best]))
+    assert faces(vehicle, best)
     assert math.dist(vehicle.position, (0, 0, -5)) < 0.3
-
-
-def test_without_whole_turn_the_first_find_is_faced() -> None:
-    first = SeenObject("car", 20.0, 6.0, track_id=1, track_score=0.5)
-    surer = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.85)
-    vehicle = KinematicVehicle()
-    Flight(SeekBehaviour(Seek("car")), vehicle, [first, surer]).run(60.0)
-    assert faces(vehicle, first)
-
-
-def test_nearest_of_equally_confident_finds_is_faced() -> None:
-    far = SeenObject("car", 34.0, 12.0, track_id=1, track_score=0.85)
-    near = SeenObject("car", -15.0, 9.0, track_id=2, track_score=0.8)
-    vehicle = KinematicVehicle()
-    found(Flight(whole_turn(), vehicle, [far, near]))
-    assert faces(vehicle, near)
-
-
-def test_two_finds_in_one_view_are_compared() -> None:
-    """The one with the higher confidence per frame has the lower track score."""
-    poor = SeenObject("car", 20.0, 0.0, confidence=0.9, track_id=1, track_score=0.45)
-    good = SeenObject("car", 20.0, 9.0, confidence=0.8, track_id=2, track_score=0.8)
-    vehicle = KinematicVehicle()
-    Flight(whole_turn(), vehicle, [poor, good]).run(60.0)
-    assert faces(vehicle, good)
 
 
 def test_often_ambiguous_find_ranks_lower() -> None:
@@ -187,15 +189,6 @@ def test_second_lap_faces_its_first_find_at_once() -> None:
 
     found(Flight(whole_turn(), vehicle, [late]), each)
     assert times[-1] < 20.0
-
-
-@pytest.mark.parametrize("with_range", [True, False])
-def test_without_tracking_two_finds_are_distinguished(with_range: bool) -> None:
-    far = SeenObject("car", 34.0, 12.0, confidence=0.5, with_range=with_range)
-    near = SeenObject("car", -15.0, 9.0, with_range=with_range)
-    vehicle = KinematicVehicle()
-    found(Flight(whole_turn(), vehicle, [far, near]))
-    assert faces(vehicle, near)
 
 
 def test_weak_last_frames_do_not_lower_a_find() -> None:

@@ -59,48 +59,19 @@ def context(gimbal_state: GimbalState | None, status: GimbalStatus = CARRIED) ->
 NOW_NS = KinematicVehicle().now_ns
 
 
-@pytest.mark.parametrize(
-    ("gimbal_state", "status", "words"),
-    [
-        pytest.param(None, CARRIED, "not responding", id="none"),
-        pytest.param(
-            gimbal(NOW_NS - 2_000_000_000),
-            CARRIED,
-            "2.0 s old",
-            id="silent",
-        ),
-        pytest.param(
-            gimbal(NOW_NS, lowest_pitch_rad=math.radians(-30.0)),
-            CARRIED,
-            "-30° to 30°",
-            id="too short",
-        ),
-        pytest.param(
-            gimbal(NOW_NS),
-            GimbalStatus(carries_camera=True, controlled_by="245/190"),
-            "245/190 has it",
-            id="another's",
-        ),
-        pytest.param(
-            gimbal(NOW_NS, primary_control=None),
-            CARRIED,
-            "primary control",
-            id="owner unknown",
-        ),
-        pytest.param(
-            gimbal(NOW_NS, status_ns=NOW_NS - round((CONTROL_MAX_AGE_S + 0.1) * 1e9)),
-            CARRIED,
-            "primary control",
-            id="owner outdated",
-        ),
-        pytest.param(
-            gimbal(NOW_NS),
-            GimbalStatus(),
-            "camera.on_gimbal",
-            id="no camera",
-        ),
-    ],
-)
+LATE_NS = NOW_NS - round((CONTROL_MAX_AGE_S + 0.1) * 1e9)
+MISSING = {
+    "none": (None, CARRIED, "not responding"),
+    "silent": (gimbal(NOW_NS - 2_000_000_000), CARRIED, "2.0 s old"),
+    "too short": (gimbal(NOW_NS, lowest_pitch_rad=math.radians(-30.0)), CARRIED, "-30° to 30°"),
+    "another's": (gimbal(NOW_NS), replace(CARRIED, controlled_by="245/190"), "245/190 has it"),
+    "owner unknown": (gimbal(NOW_NS, primary_control=None), CARRIED, "primary control"),
+    "owner outdated": (gimbal(NOW_NS, status_ns=LATE_NS), CARRIED, "primary control"),
+    "no camera": (gimbal(NOW_NS), GimbalStatus(), "camera.on_gimbal"),
+}
+
+
+@pytest.mark.parametrize(("gimbal_state", "status", "words"), MISSING.values(), ids=MISSING)
 def test_missing_gimbal_requirements_are_named(
     gimbal_state: GimbalState | None, status: GimbalStatus, words: str
 ) -> None:
@@ -111,20 +82,14 @@ def test_missing_gimbal_requirements_are_named(
 def test_nothing_is_missing_and_no_sweep_needs_no_gimbal() -> None:
     assert check_requirements(seek(), context(gimbal(NOW_NS)), None) is None
     assert check_requirements(SeekBehaviour(Seek("car")), context(None, GimbalStatus()), None) is None
-    assert (
-        check_requirements(
-            PointGimbalBehaviour(GimbalAim(-0.5)), context(gimbal(NOW_NS), GimbalStatus()), None
-        )
-        is None
-    )
+    pointing, without_camera = PointGimbalBehaviour(GimbalAim(-0.5)), context(gimbal(NOW_NS), GimbalStatus())
+    assert check_requirements(pointing, without_camera, None) is None
 
 
 @pytest.mark.parametrize(
     "behaviour", [SeekBehaviour(Seek("car")), ApproachBehaviour(Approach(Subject("car"), retries=0.0))]
 )
-def test_unknown_camera_direction_is_refused(
-    behaviour: SeekBehaviour | ApproachBehaviour,
-) -> None:
+def test_unknown_camera_direction_is_refused(behaviour: Behaviour) -> None:
     status = GimbalStatus(carries_camera=True, direction_fault="no gimbal")
     why = known(check_requirements(behaviour, context(None, status), None))
     assert "direction (no gimbal)" in why

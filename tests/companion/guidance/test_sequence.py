@@ -11,24 +11,17 @@ from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     Pending,
     assert_failed,
     assert_succeeded,
+    flying,
+    known,
+    parked,
 )
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
-
-
-def flying() -> KinematicVehicle:
-    return KinematicVehicle(mode=FlightMode.HOLD)
-
-
-def parked() -> KinematicVehicle:
-    return KinematicVehicle(
-        position=[0.0, 0.0, 0.0], mode=FlightMode.HOLD, armed=False, landed=LandedState.ON_GROUND
-    )
 
 
 def mission(harness: GuidanceHarness, *steps: dict[str, Any], **top: float | str) -> SequenceBehaviour:
@@ -43,20 +36,27 @@ def begun(harness: GuidanceHarness, behaviour: Behaviour) -> Pending:
     return harness.command(behaviour)
 
 
+def flown(
+    *steps: dict[str, Any], of: KinematicVehicle | None = None, **top: float
+) -> tuple[GuidanceHarness, SequenceBehaviour, Outcome]:
+    """A mission from its start, by default in the air, to its end."""
+    harness = GuidanceHarness(of or flying())
+    behaviour = mission(harness, *steps, **top)
+    return harness, behaviour, known(harness.outcome(begun(harness, behaviour)))
+
+
 def messages(harness: GuidanceHarness) -> list[str]:
     return [event.message for event in harness.events if event.kind is EventKind.NOTED]
 
 
 def test_mission_from_takeoff_to_landing() -> None:
-    harness = GuidanceHarness(parked())
-    behaviour = mission(
-        harness,
+    harness, behaviour, outcome = flown(
         {"do": "takeoff 5"},
         {"do": "goto 6 0", "name": "out"},
         {"do": "hold 2", "name": "wait"},
         {"do": "land"},
+        of=parked(),
     )
-    outcome = harness.outcome(begun(harness, behaviour))
     assert outcome == Outcome(True, "flown, 4 steps")
     assert [record.title for record in behaviour.records] == ["takeoff altitude=5", "out", "wait", "land"]
     assert all(record.success for record in behaviour.records)
@@ -87,20 +87,17 @@ def test_setpoints_continue_between_steps() -> None:
 
 
 def test_takeoff_after_a_landing_step() -> None:
-    harness = GuidanceHarness(parked())
-    behaviour = mission(
-        harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}
+    harness, _, outcome = flown(
+        {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}, of=parked()
     )
-    assert_succeeded(harness.outcome(begun(harness, behaviour)))
+    assert_succeeded(outcome)
     assert harness.autopilot.requests.count("arm") == 2
 
 
 def test_failed_step_ends_the_mission_in_hold() -> None:
-    harness = GuidanceHarness(flying())
-    behaviour = mission(
-        harness, {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
+    harness, _, outcome = flown(
+        {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
     )
-    outcome = harness.outcome(begun(harness, behaviour))
     assert_failed(outcome, "step 2 of 3 (long)", "timed out after 2 s: holding")
     assert harness.guidance.phase == "offboard"
     assert isinstance(harness.guidance.behaviour, HoldBehaviour)
@@ -137,11 +134,9 @@ def test_on_failure_rtl_or_land_still_fails_the_mission(branch: str, mode: Fligh
 
 
 def test_refused_step_fails_with_its_requirement() -> None:
-    harness = GuidanceHarness(parked())
-    behaviour = mission(
-        harness, {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}
+    _, _, outcome = flown(
+        {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}, of=parked()
     )
-    outcome = harness.outcome(begun(harness, behaviour))
     assert_failed(outcome, "step 3 of 4 (too late)", "in the air")
 
 
@@ -201,20 +196,16 @@ def test_refused_arming_ends_the_mission_on_the_ground() -> None:
 
 
 def test_endless_step_succeeds_at_its_timeout() -> None:
-    harness = GuidanceHarness(flying())
-    behaviour = mission(harness, {"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
-    assert_succeeded(harness.outcome(begun(harness, behaviour)))
+    _, behaviour, outcome = flown({"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
+    assert_succeeded(outcome)
     assert "4 s" in behaviour.records[0].reason
 
 
 def test_visits_limit_ends_a_loop() -> None:
-    harness = GuidanceHarness(flying())
-    behaviour = mission(
-        harness,
-        {"do": "hold 0.2", "name": "a", "visits": 3},
-        {"do": "hold 0.2", "name": "b", "on_success": "a"},
+    _, behaviour, outcome = flown(
+        {"do": "hold 0.2", "name": "a", "visits": 3}, {"do": "hold 0.2", "name": "b", "on_success": "a"}
     )
-    assert_failed(harness.outcome(begun(harness, behaviour)), "visits limit 3")
+    assert_failed(outcome, "visits limit 3")
     assert [record.title for record in behaviour.records] == ["a", "b"] * 3
 
 
@@ -228,9 +219,8 @@ def test_loop_of_steps_that_fail_at_once_ends() -> None:
 
 
 def test_mission_timeout_ends_the_current_step() -> None:
-    harness = GuidanceHarness(flying())
-    behaviour = mission(harness, {"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
-    assert_failed(harness.outcome(begun(harness, behaviour)), "after 3 s")
+    _, _, outcome = flown({"do": "hold 60", "name": "wait", "on_failure": "continue"}, timeout_s=3)
+    assert_failed(outcome, "after 3 s")
 
 
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
