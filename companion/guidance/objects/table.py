@@ -44,9 +44,10 @@ OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 # Two boxes of a frame within this bearing, or that overlap by this IoU, may be of one object: the detector
 # finds some of them twice.
 SAME_BEARING_RAD, ONE_OBJECT_IOU = 0.03, 0.5
-# Where a nearer box covers this share of a box's width at its lower edge, a part of the object is hidden: the
-# lower edge is not the object's, and perhaps not the middle. For so long its position is predicted instead.
-HIDDEN_SHARE, HIDDEN_S = 0.5, 2.0
+# Where a nearer box covers this share of a box's lower edge or of a side, that edge is not the object's: its
+# position is predicted for so long; after that a moving one has the direction alone. In a share of its own
+# size, a box ends so far from what hides its lower edge, and overlaps more with what hides its side.
+HIDDEN_SHARE, HIDDEN_S, HIDDEN_EDGE = 0.5, 2.0, 0.1
 # Without a tracker a detection within this bearing of an object that is not seen otherwise may be it.
 DIRECTION_RAD = 0.1
 # An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
@@ -239,7 +240,15 @@ class _Frame:
         self._table, self._vehicle, self._now_ns = table, vehicle, captured_ns
         of_frame = (target for target in targets if target.captured_ns == captured_ns)
         self._left = _with_unique_ids(filter(None, map(_usable, of_frame)))
-        self._hidden = {id(each) for each in self._left if _is_hidden(each, self._left)}
+        # A detector misses single frames of what hides an object, too.
+        ids = {each.track_id for each in self._left} | {None}
+        missed = [
+            each.newest
+            for each in table._objects.values()
+            if each.track_id not in ids and not each.was_occluded(captured_ns)
+        ]
+        before = [*self._left, *missed]
+        self._hidden = {id(each) for each in self._left if _is_hidden(each, before)}
         self._seen: dict[int, Target] = {}  # by object
         self._ways: dict[int, list[Estimate]] = {}
         self._fits: dict[tuple[int, int], tuple[Estimate, Fit]] = {}
@@ -261,7 +270,7 @@ class _Frame:
         if key not in self._fits:
             measured = target
             if self._partly_hidden(known, target):
-                measured = replace(target, position_ned_m=None, range_source=RangeSource.NONE)
+                measured = _without_range(target)
             fits = [
                 (way, way.fit(measured, self._vehicle)._replace(target=target))
                 for way in self._ways_of(known)
@@ -287,10 +296,12 @@ class _Frame:
         return all(math.dist(place[:2], way) > reach_m for way in ways)
 
     def _partly_hidden(self, known: _Object, target: Target) -> bool:
-        """Whether a detection shows a part of this object, which was seen whole or first of all lately."""
+        """Whether a detection shows a part of this object, which moves, or was lately seen whole or first."""
         if id(target) not in self._hidden:
             return False
-        return self._now_ns - known.shown_ns <= HIDDEN_S * 1e9
+        if known.filter is None:
+            return self._now_ns - known.first_ns <= HIDDEN_S * 1e9
+        return known.filter.moving or self._now_ns - known.filter.located_ns <= HIDDEN_S * 1e9
 
     def _owner(self, target: Target) -> _Object | None:
         return None if target.track_id is None else self._table._owners.get(target.track_id)
@@ -298,8 +309,11 @@ class _Frame:
     def _take(self, known: _Object, target: Target) -> None:
         """A detection is of this object."""
         if self._partly_hidden(known, target):
-            if known.filter is not None:
+            if known.filter is not None and self._now_ns - known.shown_ns <= HIDDEN_S * 1e9:
                 known.filter.predict(self._now_ns)
+            elif known.filter is not None:
+                expected, fit = self._fit(known, target)
+                known.filter.update(expected, fit._replace(target=_without_range(target)), self._vehicle)
             self._own(known, target)
             self._left = [each for each in self._left if each is not target]
             return
@@ -317,7 +331,7 @@ class _Frame:
         owner = self._owner(target)
         if owner is not None and owner is not known:
             owner.track_ids = tuple(each for each in owner.track_ids if each != target.track_id)
-        known.see(target, hidden=self._partly_hidden(known, target))
+        known.see(target, hidden=id(target) in self._hidden)
         if target.track_id is not None:
             self._table._owners[target.track_id] = known
         self._seen[known.object_id] = target
@@ -568,6 +582,11 @@ def _usable(target: Target) -> Target | None:
     return target
 
 
+def _without_range(target: Target) -> Target:
+    """Its direction alone."""
+    return replace(target, position_ned_m=None, range_source=RangeSource.NONE)
+
+
 def _alike(best: Fit, second: Fit) -> bool:
     """Whether two fits are too similar to prefer one."""
     return second.squared < CLEARLY_NEARER * max(best.squared, AS_GOOD)
@@ -586,17 +605,16 @@ def _with_unique_ids(targets: Iterable[Target]) -> list[Target]:
 
 
 def _is_hidden(target: Target, frame: Sequence[Target]) -> bool:
-    """Whether a confirmed object of the frame, nearer by its lower edge, hides a part of the object."""
-    left, _, right, bottom = target.box_xyxy
+    """Whether a confirmed object of the frame, nearer by its lower edge, hides an edge of the object."""
+    left, top, right, bottom = target.box_xyxy
     for other in frame:
         left2, top2, right2, bottom2 = other.box_xyxy
-        covered = min(right, right2) - max(left, left2)
-        if (
-            other.trusted
-            and covered > HIDDEN_SHARE * (right - left)
-            and top2 < bottom < bottom2
-            and _overlap(target, other) < ONE_OBJECT_IOU
-        ):
+        if not other.trusted or bottom2 <= bottom or _overlap(target, other) >= ONE_OBJECT_IOU:
+            continue
+        lap, gap = min(right, right2) - max(left, left2), HIDDEN_EDGE * (bottom2 - top2)
+        below = lap > HIDDEN_SHARE * (right - left) and top2 - gap < bottom
+        beside = lap > HIDDEN_EDGE * (right - left) and (left2 <= left or right2 >= right)
+        if below or (beside and bottom - max(top, top2) > HIDDEN_SHARE * (bottom - top)):
             return True
     return False
 
