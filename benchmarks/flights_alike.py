@@ -52,7 +52,6 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         def camera(vehicle: LockstepVehicle) -> Camera:
             return SyntheticCamera(settings, detect=detector)
 
-    chosen, other = objects
     flight = LockstepFlight.airborne(
         seed=seed, height_m=HEIGHT_M, wind_mps=float(rng.uniform(0.0, 3.0)), camera=camera
     )
@@ -65,16 +64,19 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
         if seen is None or seen.position_ned_m is None:
             return
         place = seen.position_at(moment.context.now_ns)[:2]
-        off_m = [math.dist(place, _place(item, moment.seconds)) for item in (chosen, other)]
+        off_m = [math.dist(place, _place(item, moment.seconds)) for item in objects]
         followed.append((off_m[0], off_m[1], seen.ambiguous or seen.occluded))
 
     behaviour = FollowBehaviour(Follow(Subject("car"), distance_m=DISTANCE_M, occlusion_s=OCCLUSION_S))
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
     if not followed:
         return FlightResult(seed, False, {"flown_to_other": 0.0}, "nothing was chosen")
-    # The last second: crossing cars are near each other for a moment.
-    last = followed[-20:]
-    to_chosen_m, to_other_m = (float(np.median([each[which] for each in last])) for which in (0, 1))
+    # The first second tells which car it began with; a whole one, because crossing cars are near each other.
+    first, last = followed[:20], followed[-20:]
+    begun = min((0, 1), key=lambda which: float(np.median([each[which] for each in first])))
+    to_chosen_m, to_other_m = (
+        float(np.median([each[which] for each in last])) for which in (begun, 1 - begun)
+    )
     kept = log.outcome is None and to_chosen_m < to_other_m
     unsure = log.outcome is not None or any(each[2] for each in last)
     reason = "followed to the end" if log.outcome is None else f"ended after {flight.seconds:.0f} s: "
