@@ -170,7 +170,10 @@ def simulate(
     ] = None,
     speed: Annotated[float, typer.Option(help="Simulated seconds per real second.")] = 1.0,
     noise: Annotated[
-        str, typer.Option(help="Errors of sensors and estimates as on a real vehicle: on or off.")
+        str,
+        typer.Option(
+            help="Errors of sensors and estimates: on, as on a real vehicle; off; or a scale, 0 to 10."
+        ),
     ] = "on",
     vehicles: Annotated[
         int, typer.Option(help="Number of vehicles; system ids and ports count up from those given.")
@@ -241,8 +244,11 @@ def simulate(
     _check("speed", speed, 0.05, 20.0)
     if spacing is not None:
         _check("spacing", spacing, REACH_M, 1000.0)  # closer than that they would overlap at the start
-    if noise not in ("on", "off"):
-        _fail(f"--noise {noise!r}: expected on or off")
+    try:
+        noise_scale = float({"on": "1", "off": "0"}.get(noise, noise))
+    except ValueError:
+        _fail(f"--noise {noise!r}: expected on, off or a scale")
+    _check("noise", noise_scale, 0.0, 10.0)
     parameters = _parameters(param or [])
     try:
         key = None if signing_key is None else key_of(signing_key)
@@ -274,7 +280,7 @@ def simulate(
         autopilot=autopilot,
         px4=px4,
         speed=speed,
-        noise=noise == "on",
+        noise=noise_scale,
         parameters=parameters,
         gimbal=gimbal,
         signing_key=key,

@@ -23,7 +23,7 @@ _SETTLED_S = 5.0
 
 
 @cache
-def hovering(noise: bool = True) -> LockstepVehicle:
+def hovering(noise: float = 1.0) -> LockstepVehicle:
     """A vehicle that hovers in OFFBOARD, without wind; to be copied."""
     vehicle = LockstepVehicle({"onboard": dict.fromkeys(EQUIPMENT_RATES_HZ, 0.0)}, noise=noise, gusts_mps=0.0)
     vehicle.take_off(_TAKEOFF_M)
@@ -40,7 +40,7 @@ class AutopilotModel:
     simulated by the effectiveness of the rotors.
     """
 
-    def __init__(self, count: int, *, noise: bool = True) -> None:
+    def __init__(self, count: int, *, noise: float = 1.0) -> None:
         self._noise = noise
         self.vehicles = [hovering(noise)] * count
         # views of one array, so that `_read` writes the values of all vehicles at once

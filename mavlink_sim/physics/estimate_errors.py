@@ -1,9 +1,12 @@
 """The vehicle's estimate of its motion: the truth with a navigation filter's errors, and noisy sensors.
 
 Control and telemetry use the estimate; only the truth file and the camera use the truth. Magnitudes are from
-a PX4 on its own SIH physics: telemetry at rest and in flight, and the covariances of its ODOMETRY. Errors are
+a PX4 v1.18 on its own SIH physics: telemetry beside the simulation's truth, at rest and in flight. Errors are
 Gauss-Markov processes with their own seed at fixed times, so that neither the number of links nor requests on
 them change a flight.
+
+The velocity is off by what a tilt error of some tenths of a degree integrates to; the position is off by what
+the velocity error integrates to, and is pulled back by GNSS.
 
 Faults make it jump, drift, rotate or end. Without a horizontal position it behaves as PX4's EKF2 without
 aiding: dead reckoning for EKF2_NOAID_TOUT, then an assumed standstill while height and attitude stay valid.
@@ -22,10 +25,14 @@ from typing import Any
 from mavlink_sim.physics.airframe import Multirotor, Quaternion, Vector
 from mavlink_sim.physics.gaussian import BITS, NORMAL
 
-# Standard deviations. Position: metres, the smoothed drift of the filter, (north, east, down).
-POSITION_DRIFT_M = (0.16, 0.16, 0.06)
-VELOCITY_TIME_CONSTANT_S = 1.5
-POSITION_TIME_CONSTANT_S = 6.0
+# Standard deviations, (north, east, down). Measured horizontally in three flights with manoeuvres, with 3, 0
+# and 5 m/s of wind: 0.28, 0.39 and 0.25 m/s (p50), 0.53, 0.74 and 0.50 (p95); here 0.31 and 0.65. Down it is
+# smaller than measured (0.15 m/s, and 0.33 m of position).
+VELOCITY_ERROR_MPS = (0.27, 0.27, 0.06)
+# Of the acceleration error, and again of the velocity error that follows it.
+VELOCITY_TIME_CONSTANT_S = 1.8
+POSITION_TIME_CONSTANT_S = (0.75, 0.75, 3.5)
+# Smaller than measured in flight: 0.014 of tilt, 0.03 of heading.
 TILT_ERROR_RAD = 0.003
 YAW_ERROR_RAD = 0.008
 ATTITUDE_TIME_CONSTANT_S = 4.0
@@ -46,13 +53,10 @@ GPS_STEP_S = 0.096  # a receiver of 10 Hz
 _TABLE_LENGTH = 1009
 
 _ZERO: Vector = (0.0, 0.0, 0.0)
-# Excitation of the velocity error per step and metre of drift, so that the drift has the deviation above.
+# Share kept from one step to the next, and the excitation of the acceleration error per step and m/s of
+# velocity error: two equal stages pass 1/√2 of the deviation, times their time constant.
 _VELOCITY_KEEP = 1.0 - DRIFT_STEP_S / VELOCITY_TIME_CONSTANT_S
-_VELOCITY_SPREAD = math.sqrt(
-    (VELOCITY_TIME_CONSTANT_S + POSITION_TIME_CONSTANT_S)
-    / (VELOCITY_TIME_CONSTANT_S * POSITION_TIME_CONSTANT_S**2)
-    * (1.0 - _VELOCITY_KEEP * _VELOCITY_KEEP)
-)
+_VELOCITY_SPREAD = math.sqrt(2.0 * (1.0 - _VELOCITY_KEEP * _VELOCITY_KEEP)) / VELOCITY_TIME_CONSTANT_S
 
 
 class Estimate(Multirotor):
@@ -62,7 +66,7 @@ class Estimate(Multirotor):
     Args:
         truth: the airframe.
         seed: of the errors.
-        noise: False: the estimate is the truth.
+        noise: scale of the errors; 1: as measured, 0: the estimate is the truth.
 
     Attributes:
         position, velocity, acceleration, quaternion, rates…: the estimates, as `Multirotor`'s.
@@ -74,6 +78,7 @@ class Estimate(Multirotor):
     """
 
     __slots__ = (
+        "_acceleration_error",
         "_drift_left_s",
         "_gps_left_s",
         "_index",
@@ -96,14 +101,14 @@ class Estimate(Multirotor):
         "yaw_offset_rad",
     )
 
-    def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
+    def __init__(self, truth: Multirotor, seed: int = 0, noise: float = 1.0) -> None:
         self.truth = truth
         super().__init__(seed)
         self._noise = noise
         self._noise_source = random.Random(f"estimator {seed}")
         self._rate_left_s = self._drift_left_s = self._slow_left_s = self._gps_left_s = 0.0
         gauss = self._noise_source.gauss
-        p, q, r = RATE_NOISE_RADPS
+        p, q, r = _scaled(RATE_NOISE_RADPS, noise)
         self._index = 0
         self._table = (
             [(gauss(0.0, p), gauss(0.0, q), gauss(0.0, r)) for _ in range(_TABLE_LENGTH)] if noise else []
@@ -113,6 +118,7 @@ class Estimate(Multirotor):
         self.offset: Vector = _ZERO
         self.velocity_offset: Vector = _ZERO
         self.yaw_offset_rad = 0.0
+        self._acceleration_error: Vector = _ZERO
         self.velocity_error: Vector = _ZERO
         self.attitude_error: Vector = _ZERO
         self.gps_error: Vector = _ZERO
@@ -181,26 +187,31 @@ class Estimate(Multirotor):
             self._drift(share)
 
     def _drift(self, share: float) -> None:
-        """The position's error is a low-passed velocity error, so that it has no steps."""
+        """The errors are a chain of low passes, so that none but the acceleration's has steps."""
         dt = DRIFT_STEP_S
         self._drift_left_s += dt
         bits = self._noise_source.getrandbits
+        ax, ay, az = self._acceleration_error
+        nx, ny, nz = VELOCITY_ERROR_MPS
+        spread = share * self._noise * _VELOCITY_SPREAD
+        ax = _VELOCITY_KEEP * ax + spread * nx * NORMAL[bits(BITS)]
+        ay = _VELOCITY_KEEP * ay + spread * ny * NORMAL[bits(BITS)]
+        az = _VELOCITY_KEEP * az + spread * nz * NORMAL[bits(BITS)]
+        self._acceleration_error = (ax, ay, az)
         ex, ey, ez = self.velocity_error
-        nx, ny, nz = POSITION_DRIFT_M
-        spread = share * _VELOCITY_SPREAD
-        ex = _VELOCITY_KEEP * ex + spread * nx * NORMAL[bits(BITS)]
-        ey = _VELOCITY_KEEP * ey + spread * ny * NORMAL[bits(BITS)]
-        ez = _VELOCITY_KEEP * ez + spread * nz * NORMAL[bits(BITS)]
+        ex = _VELOCITY_KEEP * ex + ax * dt
+        ey = _VELOCITY_KEEP * ey + ay * dt
+        ez = _VELOCITY_KEEP * ez + az * dt
         self.velocity_error = (ex, ey, ez)
         dx, dy, dz = self.drift
-        hold = 1.0 - dt / POSITION_TIME_CONSTANT_S
-        self.drift = (hold * dx + ex * dt, hold * dy + ey * dt, hold * dz + ez * dt)
+        tx, ty, tz = POSITION_TIME_CONSTANT_S
+        self.drift = (dx + (ex - dx / tx) * dt, dy + (ey - dy / ty) * dt, dz + (ez - dz / tz) * dt)
         gauss = self._noise_source.gauss
         self._slow_left_s -= dt
         if self._slow_left_s <= 1e-9:
             self._slow_left_s += SLOW_STEP_S
             keep = 1.0 - SLOW_STEP_S / ATTITUDE_TIME_CONSTANT_S
-            spread = math.sqrt(1.0 - keep * keep)
+            spread = self._noise * math.sqrt(1.0 - keep * keep)
             tilt, turn = spread * TILT_ERROR_RAD, spread * YAW_ERROR_RAD
             a, b, c = self.attitude_error
             self.attitude_error = (
@@ -209,18 +220,17 @@ class Estimate(Multirotor):
                 keep * c + gauss(0.0, turn),
             )
             keep = 1.0 - SLOW_STEP_S / BAROMETER_TIME_CONSTANT_S
-            self.baro_error_m = keep * self.baro_error_m + gauss(
-                0.0, BAROMETER_DRIFT_M * math.sqrt(1.0 - keep * keep)
-            )
-            noise = ACCELEROMETER_NOISE_MPS2
+            spread = self._noise * math.sqrt(1.0 - keep * keep)
+            self.baro_error_m = keep * self.baro_error_m + gauss(0.0, spread * BAROMETER_DRIFT_M)
+            noise = self._noise * ACCELEROMETER_NOISE_MPS2
             self.accelerometer_noise = (gauss(0.0, noise), gauss(0.0, noise), gauss(0.0, noise))
         self._gps_left_s -= dt
         if self._gps_left_s <= 1e-9:
             self._gps_left_s += GPS_STEP_S
-            north, east, down = GPS_NOISE_M
+            north, east, down = _scaled(GPS_NOISE_M, self._noise)
             dx, dy, dz = self.drift
             self.gps_error = (dx + gauss(0.0, north), dy + gauss(0.0, east), dz + gauss(0.0, down))
-            self.gps_velocity_error = gauss(0.0, GPS_VELOCITY_NOISE_MPS)
+            self.gps_velocity_error = gauss(0.0, self._noise * GPS_VELOCITY_NOISE_MPS)
 
     # ---- readings ---------------------------------------------------------------------------------------
 
@@ -366,7 +376,7 @@ class FallibleEstimate(Estimate):
         "reset_counter",
     )
 
-    def __init__(self, truth: Multirotor, seed: int = 0, noise: bool = True) -> None:
+    def __init__(self, truth: Multirotor, seed: int = 0, noise: float = 1.0) -> None:
         self._errors: dict[int, tuple[Vector, Vector, float]] = {}
         self.held_xy_m: tuple[float, float] | None = None
         self.reset_counter = 0

@@ -48,7 +48,7 @@ class SimulationOptions:
     autopilot: str = PX4
     px4: str | None = None
     speed: float = 1.0
-    noise: bool = True
+    noise: float = 1.0
     start_ned_m: tuple[float, float] = (0.0, 0.0)
     parameters: dict[str, float] = field(default_factory=dict)
     gimbal: bool = False

@@ -86,8 +86,9 @@ STEP_US = 4000
 # PX4 runs its position control with its estimator, at about 100 Hz, and its attitude control at every step.
 STEPS_PER_CONTROL = 3
 CONTROL_STEP_S = STEPS_PER_CONTROL * STEP_S
-# Gusts without wind: with these a held position varies as measured (std 0.26/0.25/0.09 m).
-BACKGROUND_GUSTS_MPS = 0.6
+# Gusts without wind: with these, and the estimate's errors, a held position varies as measured
+# (std 0.12 to 0.54 m, 0.09 to 0.16 m of height).
+BACKGROUND_GUSTS_MPS = 0.4
 GUST_SHARE_OF_WIND = 0.15
 OBSTACLE_SENSOR_PERIOD_S = 0.1
 CLEAR_OF_GROUND_M = 1.0  # above this height no contact is possible before the next control step
@@ -105,7 +106,7 @@ class Vehicle:
         air_seed: of the wind's direction and gusts, shared by all vehicles of this seed; None: its own.
         wind_mps: steady horizontal wind, from a random direction by the seed.
         gusts_mps: standard deviation of the gusts per axis; None for the default.
-        noise: whether sensors and estimates have a real vehicle's errors; False: they are the truth.
+        noise: scale of the errors of sensors and estimates; 1: a real vehicle's, 0: they are the truth.
         parameters: PX4 parameters that differ from `parameters.txt`.
         gimbal: with a two-axis gimbal and its parameters.
         ready_after_s: how long after boot the estimator allows arming.
@@ -154,7 +155,7 @@ class Vehicle:
         air_seed: int | None = None,
         wind_mps: float = 0.0,
         gusts_mps: float | None = None,
-        noise: bool = True,
+        noise: float = 1.0,
         parameters: Mapping[str, float] | None = None,
         gimbal: bool = False,
         ready_after_s: float = 3.0,
@@ -189,7 +190,7 @@ class Vehicle:
                 scene,
                 seed=seed,
                 gusts_mps=gusts_mps,
-                noise=noise,
+                noise=noise > 0.0,
                 start_ned_m=start_ned_m,
                 clock=self._scene_time_s,
             )

@@ -27,7 +27,7 @@ TARGET_FRAME_REFUSED = "Plnd: Frame not supported "
 
 @pytest.fixture(scope="module")
 def ready() -> LockstepVehicle:
-    vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, ready_after_s=0.0)
+    vehicle = LockstepVehicle(autopilot="ardupilot", seed=4, noise=0.0, ready_after_s=0.0)
     vehicle.send(dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     vehicle.step(0.1)
     return vehicle

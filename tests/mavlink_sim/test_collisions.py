@@ -39,7 +39,9 @@ FACE_M = 8.0 - 0.18  # the coping stands out a little
 
 
 def flying(*objects: WorldObject, height_m: float = 2.0, **options: Any) -> LockstepVehicle:
-    vehicle = LockstepVehicle({"onboard": {}}, **{"scene": World(objects), "gusts_mps": 0.0, **options})
+    vehicle = LockstepVehicle(
+        {"onboard": {}}, **{"scene": World(objects), "gusts_mps": 0.0, "noise": 0.0, **options}
+    )
     vehicle.take_off(height_m)
     return vehicle
 

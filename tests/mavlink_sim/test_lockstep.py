@@ -315,7 +315,7 @@ def test_copy_with_active_fault_refused() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 def test_setpoint_methods_send_the_stream(autopilot: str) -> None:
-    vehicle = LockstepVehicle({"onboard": {}}, autopilot=autopilot, seed=3, wind_mps=0.0, gusts_mps=0.0)
+    vehicle = LockstepVehicle({"onboard": {}}, autopilot=autopilot, seed=3, noise=0.0, gusts_mps=0.0)
     vehicle.take_off(5.0)
     vehicle.set_velocity(2.0, 0.0, 0.0)
     vehicle.step(6.0)
