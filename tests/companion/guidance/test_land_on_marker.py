@@ -14,7 +14,7 @@ from companion.guidance.requirements import check_requirements
 from companion.vehicle.state import LandedState, VehicleState
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", [4, 505, 600, pytest.param(2, marks=pytest.mark.slow)])
 def test_lands_on_the_pad_in_gusts(seed: int) -> None:
     result = land(seed, rendered=False)
     assert result.success, result.reason
