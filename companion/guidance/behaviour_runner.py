@@ -19,6 +19,7 @@ from companion.guidance.command_queue import CommandQueue
 from companion.guidance.interface import Answer, CommandInput, EventKind, GuidanceInput, OutputCollector
 from companion.guidance.limits.battery import ENDINGS, BatteryMinimum, BatteryMonitor
 from companion.guidance.mode_control import ModeControl, Phase
+from companion.guidance.motion import VelocityBias
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.setpoint import Setpoint
@@ -82,6 +83,7 @@ class BehaviourRunner:
         self._after_battery = self._activated = False
         self._stepped_ns: int | None = None
         self._position_lost_ns: int | None = None
+        self._velocity_bias = VelocityBias()
 
     def begin_command(self, behaviour: Behaviour, command: CommandInput, context: BehaviourContext) -> None:
         """Replace the active behaviour by a command's."""
@@ -97,6 +99,7 @@ class BehaviourRunner:
         self, context: BehaviourContext, before: BehaviourContext | None, inputs: GuidanceInput
     ) -> None:
         """Advance the active behaviour by one step. `before`: the previous step's input."""
+        self._velocity_bias.update(context.state)
         if self.behaviour is None:
             return
         paused_s = 0.0 if before is None else (context.now_ns - before.now_ns) / 1e9
@@ -199,13 +202,15 @@ class BehaviourRunner:
             if self.busy:
                 self.goal_ned_m = None
         dt_s = 0.0 if self._stepped_ns is None else (context.now_ns - self._stepped_ns) / 1e9
-        step: BehaviourOutput = behaviour.update(dt_s, context)
+        state = self._velocity_bias.fitting(context.state)
+        seen = context if state is context.state else replace(context, state=state)
+        step: BehaviourOutput = behaviour.update(dt_s, seen)
         for note in (*behaviour.take_notes(), *context.objects.take_notes()):
             self._out.event(EventKind.NOTED, behaviour.name, note)
         self._stepped_ns = context.now_ns
         if isinstance(step, RoutedSetpoint):
             offboard = self._modes.phase is Phase.OFFBOARD
-            step = self._setpoints.steer(step, context, behaviour.name, offboard=offboard)
+            step = self._setpoints.steer(step, seen, behaviour.name, offboard=offboard)
         self.active = active = behaviour.active
         self._landing, self.approached, self.needs = active.landing, active.approached, active.needs
         self.gimbal_user = active.name if active.gimbal_aim is not None else ""
@@ -216,7 +221,8 @@ class BehaviourRunner:
                 if step != self._modes.requested:
                     self._modes.start_request(step, context)
             case Setpoint() if self._modes.phase is Phase.OFFBOARD:
-                self._setpoints.limit(step, context, dt_s, behaviour.name, landing=self._landing)
+                asked = self._velocity_bias.command(step)
+                self._setpoints.limit(asked, context, dt_s, behaviour.name, landing=self._landing)
             case Setpoint():
                 if self._modes.phase is not Phase.ENGAGING:
                     self._modes.start_engaging(context, sent_count)

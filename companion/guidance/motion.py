@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from companion.geometry.geodesy import north_east
-from companion.vehicle.state import Vector3, VehicleState
+from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3, VehicleState, with_fields
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
 GLOBAL_MAX_AGE_S = 0.5
@@ -32,9 +34,10 @@ HOLD_INTEGRAL_MPS = 0.5
 # Farther away than this the error is remaining distance, not a disturbance to integrate.
 HOLD_INTEGRAL_M = 1.0
 # `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
-BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 0.8, 0.8
-# A larger error is a jump of the estimate: the observer starts again.
-MAX_BIAS_MPS, MAX_BIAS_ERROR_M = 0.5, 0.5
+BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 2.4, 0.8
+# A larger error is a jump of the estimate, and telemetry was missing for longer than the gap: the observer
+# starts again.
+MAX_BIAS_MPS, MAX_BIAS_ERROR_M, MAX_BIAS_GAP_S = 0.8, 0.5, 0.5
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
@@ -196,42 +199,57 @@ class VelocityBias:
     """Difference between the rate of change of the estimated position and the estimated velocity.
 
     PX4's estimates disagree by 0.3 m/s for seconds (1.17 and 1.18, SIH). The vehicle flies its velocity
-    estimate to the setpoint, so its position drifts by the difference. A second-order observer; gusts do not
-    disturb it. For circles, where a constant error turns in the circle's frame, and for landings; elsewhere
-    an integral of the position error corrects it.
-
-    Args:
-        frequency_radps: of the observer; higher follows a change of the difference faster.
+    estimate to the setpoint, so its position drifts by the difference. A second-order observer, which gusts do
+    not disturb. Behaviours get a velocity that fits the position, and what they want is given to the autopilot
+    in its own terms.
     """
 
-    def __init__(self, frequency_radps: float = BIAS_FREQUENCY_RADPS) -> None:
-        self._frequency_radps = frequency_radps
+    def __init__(self) -> None:
+        self._stamp_ns = 0
         self._predicted_m: tuple[float, float] | None = None
         self._bias_mps = (0.0, 0.0)
 
-    def update(self, state: VehicleState, dt_s: float) -> tuple[float, float]:
-        """North and east, local NED m/s, at most `MAX_BIAS_MPS`; 0 while position or velocity is unknown.
+    @property
+    def north_east_mps(self) -> tuple[float, float]:
+        """Local NED, at most `MAX_BIAS_MPS`; 0 while position or velocity is unknown."""
+        return self._bias_mps
 
-        To be called in every step. dt_s: since the last call.
-        """
+    def update(self, state: VehicleState) -> None:
+        """To be called in every step."""
         position, velocity = state.position_ned_m, state.velocity_ned_mps
-        if position is None or velocity is None:
+        dt_s, self._stamp_ns = (state.position_ns - self._stamp_ns) / 1e9, state.position_ns
+        if position is None or velocity is None or not 0.0 <= dt_s <= MAX_BIAS_GAP_S:
             self._predicted_m, self._bias_mps = None, (0.0, 0.0)
-            return self._bias_mps
+            return
         predicted = self._predicted_m or position[:2]
         error = (position[0] - predicted[0], position[1] - predicted[1])
         if math.hypot(*error) > MAX_BIAS_ERROR_M:
             predicted, error, self._bias_mps = position[:2], (0.0, 0.0), (0.0, 0.0)
-        gain = 2.0 * BIAS_DAMPING * self._frequency_radps
+        gain = 2.0 * BIAS_DAMPING * BIAS_FREQUENCY_RADPS
         north, east = (
             p + (v + b + gain * e) * dt_s
             for p, v, b, e in zip(predicted, velocity, self._bias_mps, error, strict=False)
         )
         self._predicted_m = (north, east)
-        bias = [b + self._frequency_radps**2 * e * dt_s for b, e in zip(self._bias_mps, error, strict=True)]
+        bias = [b + BIAS_FREQUENCY_RADPS**2 * e * dt_s for b, e in zip(self._bias_mps, error, strict=True)]
         shorten = min(1.0, MAX_BIAS_MPS / max(math.hypot(*bias), 1e-6))
         self._bias_mps = (bias[0] * shorten, bias[1] * shorten)
-        return self._bias_mps
+
+    def fitting(self, state: VehicleState) -> VehicleState:
+        """The state with the velocity at which its position changes."""
+        if state.velocity_ned_mps is None or self._bias_mps == (0.0, 0.0):
+            return state
+        return with_fields(state, velocity_ned_mps=self._plus(state.velocity_ned_mps, 1.0))
+
+    def command(self, setpoint: Setpoint) -> Setpoint:
+        """The setpoint that changes the position at a setpoint's velocity."""
+        if setpoint.velocity_ned_mps is None or self._bias_mps == (0.0, 0.0):
+            return setpoint
+        return replace(setpoint, velocity_ned_mps=self._plus(setpoint.velocity_ned_mps, -1.0))
+
+    def _plus(self, velocity_ned_mps: Vector3, share: float) -> Vector3:
+        north_mps, east_mps, down_mps = velocity_ned_mps
+        return (north_mps + share * self._bias_mps[0], east_mps + share * self._bias_mps[1], down_mps)
 
 
 class Arrival:

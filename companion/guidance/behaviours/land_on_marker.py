@@ -23,7 +23,7 @@ from companion.guidance.behaviour import (
 )
 from companion.guidance.behaviours.marker_search import MarkerSearch
 from companion.guidance.command import BuildContext, Command, EnumArgument, GrammarError, Number, behaviour
-from companion.guidance.motion import VelocityBias, correction, position_and_yaw, towards
+from companion.guidance.motion import correction, position_and_yaw, towards
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.from_markers import MarkerTarget
 from companion.guidance.objects.pad_filter import PadFilter
@@ -42,8 +42,6 @@ CONE_M, CONE_PER_M = 0.10, 0.20
 # Gain of the horizontal distance to the pad, 1/s, and of the velocity error: like an MPC_XY_VEL_P_ACC of 5,
 # the maximum of PX4. Tuned in lockstep in gusts, with an acceleration limit of 5 m/s².
 GAIN_PER_S, VELOCITY_ERROR_GAIN = 1.6, 1.75
-# The estimated velocity is off by 0.3 m/s, with this gain 0.2 m of position: see `VelocityBias`.
-BIAS_FREQUENCY_RADPS = 1.6
 DESCENT_MPS, SLOWEST_DESCENT_MPS, DESCENT_PER_M = 0.8, 0.2, 0.3
 # Unseen, the vehicle climbs slowly: from higher up the image covers more.
 RISE_MPS = 0.3
@@ -137,7 +135,6 @@ class LandOnMarkerBehaviour(Behaviour):
         self._by_autopilot, self._moving = by_autopilot, moving
         self._attempts, self._search_m, self._speed_mps = attempts, search_m, speed_mps
         self._pad: PadFilter | None = None
-        self._velocity_bias, self._bias_mps = VelocityBias(BIAS_FREQUENCY_RADPS), (0.0, 0.0)
         self._target: LandingTarget | None = None
         self._marker: MarkerTarget | None = None
         self._phase = _Phase.SEARCH
@@ -156,7 +153,6 @@ class LandOnMarkerBehaviour(Behaviour):
         position, _ = position_and_yaw(context.state)
         self._started_down_m = position[2]
         self._pad = self._target = self._blind_since_ns = None
-        self._velocity_bias = VelocityBias(BIAS_FREQUENCY_RADPS)
         self._failures = []
         # Frames captured before the command are ignored: they may show another point.
         self._newest_ns = context.now_ns
@@ -165,7 +161,6 @@ class LandOnMarkerBehaviour(Behaviour):
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         position, _ = position_and_yaw(context.state)
         self._observe(context)
-        self._bias_mps = self._velocity_bias.update(context.state, dt_s)
         if self._pad is not None:
             self._height_m = self._pad.at(context.now_ns)[2] - position[2]
         state = context.state
@@ -382,7 +377,7 @@ class LandOnMarkerBehaviour(Behaviour):
     ) -> Setpoint:
         """Setpoint towards a horizontal point that moves with `drift`, and down (negative: up) at a rate."""
         north, east = towards(point, position, GAIN_PER_S, self._speed_mps)
-        wanted = (north + drift[0] - self._bias_mps[0], east + drift[1] - self._bias_mps[1])
+        wanted = (north + drift[0], east + drift[1])
         now_north, now_east, _ = context.state.velocity_ned_mps or (*wanted, 0.0)
         north = wanted[0] + VELOCITY_ERROR_GAIN * (wanted[0] - now_north)
         east = wanted[1] + VELOCITY_ERROR_GAIN * (wanted[1] - now_east)

@@ -22,7 +22,6 @@ from companion.guidance.command import (
 )
 from companion.guidance.motion import (
     STOPPING_MPS2,
-    VelocityBias,
     correction,
     in_degrees,
     laps_text,
@@ -137,7 +136,6 @@ class OrbitBehaviour(Behaviour):
         self._flown_rad = 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
-        self._bias = VelocityBias()
         self._until_ns: float = math.inf
 
     def on_activate(self, context: BehaviourContext) -> None:
@@ -146,7 +144,6 @@ class OrbitBehaviour(Behaviour):
         self._angle_rad, self._flown_rad = None, 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
         self._asked_mps = (0.0, 0.0)
-        self._bias = VelocityBias()
         self._centre, self._drift_mps = None, (0.0, 0.0)
         if self.subject is None:
             self._centre = (
@@ -202,7 +199,6 @@ class OrbitBehaviour(Behaviour):
                 False, f"orbit timed out after {self._flown_rad / math.tau:.1f} of {self._laps:g} laps"
             )
 
-        bias = self._bias.update(context.state, dt_s)
         if distance < MIN_RADIUS_M:
             return Setpoint.velocity(
                 (self._speed_mps, 0.0, correction(self._down_m - position[2])), context.now_ns
@@ -211,7 +207,7 @@ class OrbitBehaviour(Behaviour):
         # All of this is relative to the centre, which may move.
         measured = context.state.velocity_ned_mps or (0.0, 0.0, 0.0)
         drift = self._drift_mps
-        north_mps, east_mps = measured[0] + bias[0] - drift[0], measured[1] + bias[1] - drift[1]
+        north_mps, east_mps = measured[0] - drift[0], measured[1] - drift[1]
         out_mps = outward[0] * north_mps + outward[1] * east_mps
         along_mps = self._turn * (outward[0] * east_mps - outward[1] * north_mps)
         self._adapt_pace(along_mps, distance, context.max_acceleration_mps2, dt_s)
@@ -219,8 +215,8 @@ class OrbitBehaviour(Behaviour):
         self._asked_mps = (asked_out_mps, asked_along_mps)
         around_mps = self._turn * asked_along_mps
         velocity = (
-            outward[0] * asked_out_mps - outward[1] * around_mps - bias[0] + drift[0],
-            outward[1] * asked_out_mps + outward[0] * around_mps - bias[1] + drift[1],
+            outward[0] * asked_out_mps - outward[1] * around_mps + drift[0],
+            outward[1] * asked_out_mps + outward[0] * around_mps + drift[1],
             correction(self._down_m - position[2]),
         )
         bearing = math.atan2(-east, -north)

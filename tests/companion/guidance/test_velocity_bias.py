@@ -5,29 +5,48 @@ from __future__ import annotations
 import pytest
 
 from companion.guidance.motion import MAX_BIAS_MPS, VelocityBias
+from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 
-STEP_S = 0.05
-VELOCITY_MPS = (3.0, -1.0, 0.0)
+STEP_NS = 50_000_000
+VELOCITY_MPS = (3.0, -1.0, 0.2)
+BEGIN_NS = 10**12
 
 
-def state(north_m: float, east_m: float) -> VehicleState:
-    return VehicleState(position_ned_m=(north_m, east_m, -5.0), velocity_ned_mps=VELOCITY_MPS)
+def state(north_m: float, east_m: float, stamp_ns: int) -> VehicleState:
+    return VehicleState(
+        position_ned_m=(north_m, east_m, -5.0), velocity_ned_mps=VELOCITY_MPS, position_ns=stamp_ns
+    )
 
 
-def observed(rate_mps: tuple[float, float], seconds: float, jump_m: float = 0.0) -> list[tuple[float, float]]:
+def observed(
+    rate_mps: tuple[float, float], seconds: float, jump_m: float = 0.0, repeats: int = 1
+) -> list[tuple[float, float]]:
     """Biases of each step while the position moves at a rate; halfway it jumps north."""
-    bias, steps = VelocityBias(), round(seconds / STEP_S)
-    return [
-        bias.update(
-            state(rate_mps[0] * i * STEP_S + jump_m * (i > steps // 2), rate_mps[1] * i * STEP_S), STEP_S
-        )
-        for i in range(steps)
-    ]
+    bias, steps = VelocityBias(), round(seconds * 1e9 / STEP_NS)
+    found = []
+    for i in range(steps):
+        now_s = i * STEP_NS / 1e9
+        jumped_m = jump_m * (i > steps // 2)
+        received = state(rate_mps[0] * now_s + jumped_m, rate_mps[1] * now_s, BEGIN_NS + i * STEP_NS)
+        for _ in range(repeats):
+            bias.update(received)
+        found.append(bias.north_east_mps)
+    return found
 
 
-def test_rate_and_velocity_difference_is_found_within_8_s() -> None:
-    assert observed((3.2, -1.1), 8.0)[-1] == pytest.approx((0.2, -0.1), abs=0.01)
+def after(seconds: float) -> VelocityBias:
+    """One that has found 0.2 m/s north, 0.1 m/s west."""
+    bias = VelocityBias()
+    for i in range(round(seconds * 1e9 / STEP_NS)):
+        now_s = i * STEP_NS / 1e9
+        bias.update(state(3.2 * now_s, -1.1 * now_s, BEGIN_NS + i * STEP_NS))
+    return bias
+
+
+@pytest.mark.parametrize("repeats", [1, 3])
+def test_rate_and_velocity_difference_is_found_within_4_s(repeats: int) -> None:
+    assert observed((3.2, -1.1), 4.0, repeats=repeats)[-1] == pytest.approx((0.2, -0.1), abs=0.01)
 
 
 def test_result_is_limited() -> None:
@@ -41,9 +60,30 @@ def test_jump_of_the_position_is_no_velocity(jump_m: float) -> None:
     assert max(abs(north_mps) for north_mps, _ in observed(VELOCITY_MPS[:2], 8.0, jump_m)) < 0.01
 
 
+@pytest.mark.parametrize("gap_ns", [600_000_000, -600_000_000, 10**11])
+def test_gap_of_telemetry_starts_again(gap_ns: int) -> None:
+    bias = after(4.0)
+    bias.update(state(3.2 * 4.0, -1.1 * 4.0, BEGIN_NS + 4 * 10**9 - STEP_NS + gap_ns))
+    assert bias.north_east_mps == (0.0, 0.0)
+
+
 def test_unknown_state_starts_again() -> None:
-    bias = VelocityBias()
-    for index in range(100):
-        bias.update(state(3.2 * index * STEP_S, 0.0), STEP_S)
-    assert bias.update(VehicleState(), STEP_S) == (0.0, 0.0)
-    assert bias.update(state(500.0, 0.0), STEP_S) == (0.0, 0.0)
+    bias = after(4.0)
+    bias.update(VehicleState())
+    assert bias.north_east_mps == (0.0, 0.0)
+    bias.update(state(500.0, 0.0, BEGIN_NS))
+    bias.update(state(500.0, 0.0, BEGIN_NS))
+    assert bias.north_east_mps == (0.0, 0.0)
+
+
+def test_state_and_setpoint_are_corrected_oppositely() -> None:
+    bias = after(4.0)
+    fitting = bias.fitting(state(0.0, 0.0, BEGIN_NS))
+    assert fitting.velocity_ned_mps == pytest.approx((3.2, -1.1, 0.2), abs=0.01)
+    assert fitting.position_ned_m == (0.0, 0.0, -5.0)
+    wanted = Setpoint.velocity((1.0, 0.0, -0.5), BEGIN_NS, yaw_rad=1.0)
+    command = bias.command(wanted)
+    assert command.velocity_ned_mps == pytest.approx((0.8, 0.1, -0.5), abs=0.01)
+    assert command.yaw_rad == 1.0
+    place = Setpoint.position((1.0, 2.0, -5.0), BEGIN_NS)
+    assert bias.command(place) is place
