@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import os
 import select
 import socket
 import struct
@@ -25,6 +26,9 @@ import zenoh
 
 from companion.bus.client import listen, send_command
 from companion.vehicle.link_url import LinkScheme, LinkUrl
+from mavlink_sim.camera.vehicle_pose import AutopilotLink as TruthLink
+from mavlink_sim.camera.vehicle_pose import Pose as TruePose
+from mavlink_sim.camera.vehicle_pose import PoseHistory
 from mavlink_sim.testing import free_port
 from mavlink_sim.wire.messages import dialect
 from tests.companion.service_process import ServiceProcess
@@ -50,6 +54,8 @@ CONNECT_S, RECONNECT_S, RECONNECT_EVERY_S = 10.0, 60.0, 0.2
 ORBIT_M, ORBIT_MPS = 10.0, 2.8
 # A shell command that restarts a simulated autopilot that refuses to reboot, as PX4's does.
 RESTART = "COMPANION_SITL_RESTART"
+# The port of a simulation's true pose, HIL_STATE_QUATERNION.
+TRUTH_URL = "COMPANION_SITL_TRUTH_URL"
 # Measured: by autopilot and driver, by what was flown.
 FIGURES: dict[str, dict[str, dict[str, float | None]]] = {}
 
@@ -510,6 +516,45 @@ def repeated(period_s: float, act: Iterator[None]) -> Iterator[None]:
     finally:
         ended.set()
         thread.join(5.0)
+
+
+class Truth:
+    """The simulation's own pose, in metres from where it began; `poses`: with CLOCK_MONOTONIC seconds."""
+
+    def __init__(self, url: str) -> None:
+        self._link, self._history = TruthLink(url, listen_only=True), PoseHistory()
+        self.poses: list[tuple[float, TruePose]] = []
+
+    def read(self) -> Iterator[None]:
+        """Wait for the newest pose, and keep it."""
+        while True:
+            for message in self._link.receive(1.0):
+                self._history.add(message, time.monotonic_ns())
+            if self._history.truth and (span := self._history.span_ns):
+                self.poses.append((self._history.monotonic_ns(span[1]) / 1e9, self._history.at(span[1])))
+            yield
+
+    def at(self, time_s: float) -> tuple[float, float]:
+        """North and east when something else arrived."""
+        pose = min(self.poses[-50:], key=lambda item: abs(item[0] - time_s))[1]
+        return pose.position[0], pose.position[1]
+
+    def close(self) -> None:
+        self._link.close()
+
+
+@contextlib.contextmanager
+def true_poses(link: AutopilotLink) -> Iterator[Truth]:
+    """The simulation's own pose, read in a thread. Skips where COMPANION_SITL_TRUTH_URL names no port."""
+    if TRUTH_URL not in os.environ:
+        pytest.skip(f"{TRUTH_URL} names no port with the simulation's true pose")
+    truth = Truth(os.environ[TRUTH_URL])
+    try:
+        with repeated(0.0, truth.read()):
+            link.until(lambda: truth.poses, 5.0, f"sending HIL_STATE_QUATERNION to {TRUTH_URL}")
+            yield truth
+    finally:
+        truth.close()
 
 
 def set_for_test(link: AutopilotLink, values: dict[str, float]) -> dict[str, float]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 import secrets
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,20 +14,27 @@ import pytest
 
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.simulated_camera import SimulatedCamera
-from mavlink_sim.camera.vehicle_pose import AutopilotLink as TruthLink
-from mavlink_sim.camera.vehicle_pose import Pose, PoseHistory
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.structures import PLATE_THICKNESS_M
 from mavlink_sim.world.world import Ground, World, WorldObject
 from tests.companion.service_process import running_service
 from tests.sitl.conftest import Services
-from tests.sitl.sitl_harness import PX4, READY_S, AutopilotLink, Flight, bring_down, repeated, set_for_test
+from tests.sitl.sitl_harness import (
+    PX4,
+    READY_S,
+    AutopilotLink,
+    Flight,
+    Truth,
+    bring_down,
+    repeated,
+    set_for_test,
+    true_poses,
+)
 from vision.camera_model import CameraModel, CameraMount
 from vision.rotation import matrix_from_quaternion
 from vision.shared_frame import SharedFrameWriter
 
 pytestmark = [pytest.mark.sitl, pytest.mark.timeout(400), pytest.mark.realtime]
-TRUTH_URL = "COMPANION_SITL_TRUTH_URL"
 CAMERA = CameraModel.from_horizontal_fov(400, 300, math.radians(80.0))
 MOUNT = CameraMount(pitch_rad=math.radians(-80.0))
 DICTIONARY, SIZE_M, PERIOD_S, HEIGHT_M = "APRILTAG_36h11", 0.4, 0.08, 3.0
@@ -39,31 +44,6 @@ MAT = [(1.5 * (row - 1), 1.5 * (column - 2), 0.7 * (row + column)) for row in ra
 VISION = {"EKF2_EV_CTRL": 9.0, "EKF2_EV_DELAY": 80.0}
 # PX4 stops using GNSS some seconds after its last fix, and resets its position to the map's.
 SETTLED_S = 12.0
-
-
-class Truth:
-    """The simulation's own pose, in metres from where it began; `poses`: with CLOCK_MONOTONIC seconds."""
-
-    def __init__(self, url: str) -> None:
-        self._link, self._history = TruthLink(url, listen_only=True), PoseHistory()
-        self.poses: list[tuple[float, Pose]] = []
-
-    def read(self) -> Iterator[None]:
-        """Wait for the newest pose, and keep it."""
-        while True:
-            for message in self._link.receive(1.0):
-                self._history.add(message, time.monotonic_ns())
-            if self._history.truth and (span := self._history.span_ns):
-                self.poses.append((self._history.monotonic_ns(span[1]) / 1e9, self._history.at(span[1])))
-            yield
-
-    def at(self, time_s: float) -> tuple[float, float]:
-        """North and east when something else arrived."""
-        pose = min(self.poses[-50:], key=lambda item: abs(item[0] - time_s))[1]
-        return pose.position[0], pose.position[1]
-
-    def close(self) -> None:
-        self._link.close()
 
 
 def frames(truth: Truth, writer: SharedFrameWriter) -> Iterator[None]:
@@ -99,15 +79,11 @@ def test_without_gnss_above_a_map_the_vehicle_keeps_its_place(
 ) -> None:
     if link.autopilot != PX4:
         pytest.skip("the parameters of this test are PX4's")
-    if TRUTH_URL not in os.environ:
-        pytest.skip(f"{TRUTH_URL} names no port with the simulation's true pose")
+    reading = ExitStack()
+    truth = reading.enter_context(true_poses(link))
     bring_down(link)
     services.close()  # its own service takes the port
     link.until(lambda: link.ready, READY_S, "ready to be armed")
-    truth = Truth(os.environ[TRUTH_URL])
-    reading = ExitStack()
-    reading.enter_context(repeated(0.0, truth.read()))
-    link.until(lambda: truth.poses, 5.0, f"sending HIL_STATE_QUATERNION to {TRUTH_URL}")
     estimate, begun = link.poses[-1].position_ned_m, truth.poses[-1][1].position
     origin = tuple(there - here for there, here in zip(estimate, begun, strict=True))
     (tmp_path / "map.toml").write_text(map_text((origin[0], origin[1], origin[2])))
@@ -160,4 +136,3 @@ def test_without_gnss_above_a_map_the_vehicle_keeps_its_place(
             link.set_parameter(parameter, value)
         bring_down(link)
         reading.close()
-        truth.close()

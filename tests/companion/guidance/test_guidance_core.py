@@ -309,7 +309,7 @@ def test_sent_setpoint_is_passed_to_the_behaviour() -> None:
     engaged(harness, behaviour)
     harness.run(5.0)
     assert harness.guidance.asked is not None
-    assert harness.guidance.asked.velocity_ned_mps == (9.0, 0.0, 0.0)
+    assert harness.guidance.asked.velocity_ned_mps == pytest.approx((9.0, 0.0, 0.0), abs=1e-3)
     assert harness.guidance.sent is not None
     assert harness.guidance.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
     assert harness.guidance.limited_by

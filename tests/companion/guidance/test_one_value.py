@@ -98,7 +98,7 @@ def test_object_is_the_same_value_everywhere(
     scene = [SceneObject("car", CAR, chosen), SceneObject("car", CAR, crossing)]
     detector = SyntheticDetector(scene, CAMERA, MOUNT, seed=5)
     camera = SyntheticCamera(camera_settings(CAMERA, MOUNT, {}), detect=detector)
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3), camera=camera)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, noise=0.0), camera=camera)
     published, step = Published(flight), flight.guidance.step
     flown: dict[int, tuple[TrackedObject, ...]] = {}  # by capture, as behaviours get them
     steered: list[TrackedObject] = []
