@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from companion.geometry.geodesy import north_east
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3, VehicleState, with_fields
+from companion.vehicle.state import LandedState, Vector3, VehicleState, with_fields
 
 # GLOBAL_POSITION_INT comes 5 to 50 times a second.
 GLOBAL_MAX_AGE_S = 0.5
@@ -199,9 +199,9 @@ class VelocityBias:
     """Difference between the rate of change of the estimated position and the estimated velocity.
 
     PX4's estimates disagree by 0.3 m/s for seconds (1.17 and 1.18, SIH). The vehicle flies its velocity
-    estimate to the setpoint, so its position drifts by the difference. A second-order observer, which gusts do
-    not disturb. Behaviours get a velocity that fits the position, and what they want is given to the autopilot
-    in its own terms.
+    estimate to the setpoint, so its position drifts by the difference. A second-order observer, which gusts
+    do not disturb. Behaviours get the velocity that fits the position, and the autopilot gets what they want
+    in terms of its own estimate.
     """
 
     def __init__(self) -> None:
@@ -211,14 +211,16 @@ class VelocityBias:
 
     @property
     def north_east_mps(self) -> tuple[float, float]:
-        """Local NED, at most `MAX_BIAS_MPS`; 0 while position or velocity is unknown."""
+        """Local NED, at most `MAX_BIAS_MPS`; 0 on the ground, and while position or velocity is unknown."""
         return self._bias_mps
 
     def update(self, state: VehicleState) -> None:
         """To be called in every step."""
         position, velocity = state.position_ned_m, state.velocity_ned_mps
         dt_s, self._stamp_ns = (state.position_ns - self._stamp_ns) / 1e9, state.position_ns
-        if position is None or velocity is None or not 0.0 <= dt_s <= MAX_BIAS_GAP_S:
+        # An estimate that drifts on the ground is no reason to lean at lift-off.
+        flies = state.landed is not LandedState.ON_GROUND
+        if position is None or velocity is None or not flies or not 0.0 <= dt_s <= MAX_BIAS_GAP_S:
             self._predicted_m, self._bias_mps = None, (0.0, 0.0)
             return
         predicted = self._predicted_m or position[:2]

@@ -205,7 +205,7 @@ def test_overlapping_start_refused() -> None:
 def test_lockstep_vehicles_collide() -> None:
     pair = [
         LockstepVehicle(
-            {"onboard": {}}, system_id=number, seed=number, gusts_mps=0.0, start_ned_m=(start, 0.0)
+            {"onboard": {}}, system_id=number, seed=number, noise=0.0, gusts_mps=0.0, start_ned_m=(start, 0.0)
         )
         for number, start in ((1, 0.0), (2, 6.0))
     ]

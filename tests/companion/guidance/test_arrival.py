@@ -1,7 +1,7 @@
 """Arrival accuracy of behaviours, in lockstep with the simulated vehicle in wind and gusts.
 
 The simulated vehicle moves like a measured PX4 (velocity step, stop and overshoot); the others respond more
-slowly. Distances are by the vehicle's own estimate, whose error comes on top.
+slowly. The estimate is exact, but for the last tests; its error comes on top.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TypedDict
 
 import pytest
 
+from benchmarks import flights_hold, flights_orbit_calm
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight, Moment, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
@@ -56,13 +57,20 @@ class Air(TypedDict):
     seed: int
     wind_mps: float
     gusts_mps: float
+    noise: float
     parameters: dict[str, float]
 
 
 def air(name: str, seed: int) -> Air:
     """Options of a flight in some wind."""
     wind_mps = random.Random(seed).uniform(0.0, 3.0)
-    return {"seed": seed, "wind_mps": wind_mps, "gusts_mps": GUSTS_MPS, "parameters": VEHICLES[name]}
+    return {
+        "seed": seed,
+        "wind_mps": wind_mps,
+        "gusts_mps": GUSTS_MPS,
+        "noise": 0.0,
+        "parameters": VEHICLES[name],
+    }
 
 
 def then_hold(
@@ -220,3 +228,16 @@ def test_takeoff_reaches_and_reports_its_height(name: str, seed: int, height_m: 
     assert altitude_m == pytest.approx(height_m, abs=0.3)
     assert outcome.reason.startswith("took off, ")
     assert float(outcome.reason.split()[2]) == pytest.approx(altitude_m, abs=0.1)
+
+
+# Without the correction of the estimated velocity none of these is within it.
+@pytest.mark.parametrize("seed", [3000, *(pytest.param(n, marks=pytest.mark.slow) for n in (3001, 3004))])
+def test_hold_stays_within_0_3_m_with_a_px4s_estimate(seed: int) -> None:
+    result = flights_hold.run(seed)
+    assert result.success, result
+
+
+@pytest.mark.parametrize("seed", [4009, *(pytest.param(n, marks=pytest.mark.slow) for n in (4012, 4014))])
+def test_orbit_keeps_its_radius_with_a_px4s_estimate(seed: int) -> None:
+    result = flights_orbit_calm.run(seed)
+    assert result.success, result

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from companion.guidance.motion import MAX_BIAS_MPS, VelocityBias
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import VehicleState
+from companion.vehicle.state import LandedState, VehicleState
 
 STEP_NS = 50_000_000
 VELOCITY_MPS = (3.0, -1.0, 0.2)
@@ -65,6 +67,14 @@ def test_gap_of_telemetry_starts_again(gap_ns: int) -> None:
     bias = after(4.0)
     bias.update(state(3.2 * 4.0, -1.1 * 4.0, BEGIN_NS + 4 * 10**9 - STEP_NS + gap_ns))
     assert bias.north_east_mps == (0.0, 0.0)
+
+
+def test_none_on_the_ground() -> None:
+    bias = after(4.0)
+    parked = replace(state(0.0, 0.0, BEGIN_NS + 4 * 10**9), landed=LandedState.ON_GROUND)
+    bias.update(parked)
+    assert bias.north_east_mps == (0.0, 0.0)
+    assert bias.fitting(parked) is parked
 
 
 def test_unknown_state_starts_again() -> None:
