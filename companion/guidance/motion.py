@@ -218,8 +218,8 @@ class VelocityBias:
         """To be called in every step."""
         position, velocity = state.position_ned_m, state.velocity_ned_mps
         dt_s, self._stamp_ns = (state.position_ns - self._stamp_ns) / 1e9, state.position_ns
-        # An estimate that drifts on the ground is no reason to lean at lift-off.
-        flies = state.landed is not LandedState.ON_GROUND
+        # An estimate that drifts before or at lift-off is no reason to lean there.
+        flies = state.landed not in (LandedState.ON_GROUND, LandedState.TAKING_OFF)
         if position is None or velocity is None or not flies or not 0.0 <= dt_s <= MAX_BIAS_GAP_S:
             self._predicted_m, self._bias_mps = None, (0.0, 0.0)
             return
