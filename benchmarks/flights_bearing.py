@@ -22,7 +22,7 @@ from companion.bench.lockstep_flight import Camera, LockstepFlight, Moment
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.objects.from_detections import StateHistory
 from companion.vehicle.state import VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
@@ -115,7 +115,8 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
                 errors_deg[way].append(abs(math.degrees(off)))
             leaning_deg.append(math.degrees(math.acos(min(1.0, float(truth[2, 2])))))
 
-    log = flight.fly(OrbitBehaviour(RADIUS_M, SPEED_MPS, 0.0, clockwise=bool(seed % 2)), LIMIT_S, judge)
+    orbit = Orbit(None, RADIUS_M, SPEED_MPS, direction=("counterclockwise", "clockwise")[seed % 2])
+    log = flight.fly(OrbitBehaviour(orbit), LIMIT_S, judge)
     if not leaning_deg:
         return FlightResult(seed, False, {}, "the thing in the middle was never seen")
     p95: Callable[[list[float]], float] = lambda values: float(np.percentile(values, 95))  # noqa: E731

@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks.flights import FlightResult
 from companion.bench.lockstep_flight import LockstepFlight
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.motion import ground_speed, position_and_yaw
 from vision.attitude import wrap_angle
 
@@ -31,7 +31,8 @@ def fly(seed: int, gusts_mps: float) -> FlightResult:
     """One flight."""
     wind_mps = random.Random(seed).uniform(0.0, 3.0)
     flight = LockstepFlight.airborne(seed=seed, wind_mps=wind_mps, gusts_mps=gusts_mps)
-    orbit = OrbitBehaviour(RADIUS_M, SPEED_MPS, LAPS, clockwise=bool(seed % 2))
+    direction = ("counterclockwise", "clockwise")[seed % 2]
+    orbit = OrbitBehaviour(Orbit(None, RADIUS_M, SPEED_MPS, LAPS, direction))
     log = flight.fly(orbit, LIMIT_S)
     if log.outcome is None or not log.outcome.success:
         reason = f"not flown in {LIMIT_S:g} s" if log.outcome is None else log.outcome.reason

@@ -92,14 +92,7 @@ class Orbit(Command):
             )
 
     def build(self, context: BuildContext) -> Behaviour:
-        clockwise = self.direction == "clockwise"
-        return OrbitBehaviour(
-            self.radius_m,
-            self.speed_mps,
-            self.laps,
-            clockwise=clockwise,
-            subject=self.subject,
-        )
+        return OrbitBehaviour(self)
 
 
 class OrbitBehaviour(Behaviour):
@@ -117,21 +110,16 @@ class OrbitBehaviour(Behaviour):
     name = "orbit"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR})
 
-    def __init__(
-        self,
-        radius_m: float = 10.0,
-        speed_mps: float = 2.0,
-        laps: float = 0.0,
-        *,
-        clockwise: bool = True,
-        subject: Subject | None = None,
-    ) -> None:
-        self.subject = subject
-        self._radius_m, self._speed_mps, self._laps = radius_m, speed_mps, laps
-        self._turn = 1.0 if clockwise else -1.0
+    def __init__(self, command: Orbit) -> None:
+        self.subject = command.subject
+        self._radius_m, self._speed_mps, self._laps = command.radius_m, command.speed_mps, command.laps
+        self._turn = 1.0 if command.direction == "clockwise" else -1.0
+        self._begin(0.0)
+
+    def _begin(self, down_m: float) -> None:
         self._centre: Vector3 | None = None
         self._drift_mps = (0.0, 0.0)
-        self._down_m = 0.0
+        self._down_m = down_m
         self._angle_rad: float | None = None
         self._flown_rad = 0.0
         self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
@@ -140,11 +128,7 @@ class OrbitBehaviour(Behaviour):
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, yaw_rad = position_and_yaw(context.state)
-        self._down_m = position[2]
-        self._angle_rad, self._flown_rad = None, 0.0
-        self._out_mps = self._drag_mps2 = self._lead_rad = self._pace_mps = self._turning_mps2 = 0.0
-        self._asked_mps = (0.0, 0.0)
-        self._centre, self._drift_mps = None, (0.0, 0.0)
+        self._begin(position[2])
         if self.subject is None:
             self._centre = (
                 position[0] + self._radius_m * math.cos(yaw_rad),
@@ -153,7 +137,6 @@ class OrbitBehaviour(Behaviour):
             )
         else:
             context.objects.forget(self.subject)
-        self._until_ns = math.inf
 
     def _begin_circle(self, centre: Vector3, position: Vector3, context: BehaviourContext) -> None:
         path_m = self._laps * math.tau * self._radius_m

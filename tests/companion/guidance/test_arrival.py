@@ -23,7 +23,7 @@ from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.guidance.objects.tracked_object import Subject
@@ -179,7 +179,8 @@ def on_circle(
     flight = LockstepFlight.airborne(**air(name, seed))
     assert isinstance(flight.driver, SimulatedDriver)
     flight.driver.vehicle.vehicle.estimate.velocity_offset = velocity_error_mps
-    orbit = OrbitBehaviour(radius_m, speed_mps, laps, clockwise=bool(seed % 2))
+    direction = ("counterclockwise", "clockwise")[seed % 2]
+    orbit = OrbitBehaviour(Orbit(None, radius_m, speed_mps, laps, direction))
     log = flight.fly(orbit, 150.0)
     assert_succeeded(log.outcome)
     centre = known(orbit._centre)

@@ -13,7 +13,7 @@ from companion.guidance import Approach, Follow
 from companion.guidance.behaviours.approach import ApproachBehaviour
 from companion.guidance.behaviours.follow import FollowBehaviour
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.grammar import json_schema, markdown, usage
 from companion.guidance.interface import EventKind, GuidanceInput
@@ -91,7 +91,7 @@ def test_ended_track_is_refused_with_the_nearest_of_its_class() -> None:
     harness.run(0.5)
     first.visible = False
     harness.run(14.0)
-    reason = refused(harness, OrbitBehaviour(subject=Subject(track_id=17)))
+    reason = refused(harness, OrbitBehaviour(Orbit(subject=Subject(track_id=17))))
     assert "track 17 ended 12 s ago" in reason
     assert "nearest car" in reason
     assert "track 23, 1.2 m from" in reason
@@ -165,7 +165,7 @@ def test_approach_flies_to_the_farther_car() -> None:
 
 def test_orbit_is_about_the_track() -> None:
     flight = Flight(
-        OrbitBehaviour(8.0, 3.0, laps=1.0, subject=Subject(track_id=2)),
+        OrbitBehaviour(Orbit(radius_m=8.0, speed_mps=3.0, laps=1.0, subject=Subject(track_id=2))),
         objects=[car(12, 0, 1), car(16, 5, 2)],
     )
     flight.latency_s = 0.0  # it begins after the first frame, as its requirement demands

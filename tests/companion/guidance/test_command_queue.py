@@ -9,7 +9,7 @@ import pytest
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.gimbal.controller import FIND_TIMEOUT_S
 from companion.guidance.interface import EventKind, FindGimbal, GuidanceInput, Request
 from companion.vehicle.gimbal import GimbalAim
@@ -126,7 +126,7 @@ def test_end_of_service_supersedes_it() -> None:
 def test_loss_of_command_supersedes_it() -> None:
     waiting = Waiting()
     harness = waiting.harness
-    harness.command(OrbitBehaviour())
+    harness.command(OrbitBehaviour(Orbit()))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     later = harness.command(NeedsGimbal())
     harness.streaming = False

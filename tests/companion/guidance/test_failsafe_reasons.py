@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.interface import GuidanceInput
 from companion.guidance.mode_control import REASON_WAIT_S
 from companion.vehicle.report import Report
@@ -99,7 +99,7 @@ def test_heartbeat_first_stops_stream_and_waits_for_reason(
         )
 
     harness = GuidanceHarness(flying(), inputs=modify)
-    future = engaged(harness, OrbitBehaviour())
+    future = engaged(harness, OrbitBehaviour(Orbit()))
     harness.autopilot.change_mode(FlightMode.RETURN)
     changed_ns.append(harness.vehicle.now_ns)
     harness.run()
@@ -142,7 +142,7 @@ def failsafe_inputs(name: str, text: str) -> Callable[[GuidanceInput], GuidanceI
 def test_lasting_hold_is_confirmed_one_before_rtl_is_not(name: str, text: str, asks: list[str]) -> None:
     """PX4 leaves its hold for a return when setpoints stop, unless hold was requested last."""
     harness = GuidanceHarness(flying(), inputs=failsafe_inputs(name, text))
-    future = harness.command(OrbitBehaviour(radius_m=5.0))
+    future = harness.command(OrbitBehaviour(Orbit(radius_m=5.0)))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(0.2)
     harness.autopilot.requests.clear()
@@ -171,7 +171,7 @@ def test_hold_is_confirmed_when_its_event_comes_late(late_s: float) -> None:
         return replace(inputs, state=changed)
 
     harness = GuidanceHarness(flying(), inputs=modify)
-    harness.command(OrbitBehaviour(radius_m=5.0))
+    harness.command(OrbitBehaviour(Orbit(radius_m=5.0)))
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
     harness.run(0.2)
     harness.autopilot.requests.clear()

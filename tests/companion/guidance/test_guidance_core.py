@@ -9,7 +9,7 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.gimbal.controller import ENDING
@@ -59,7 +59,7 @@ def test_hold_follows_a_behaviour_until_the_next_command() -> None:
 def test_new_command_replaces_behaviour_within_offboard() -> None:
     harness = GuidanceHarness(flying())
     future = engaged(harness, HoldBehaviour())
-    second = harness.command(OrbitBehaviour(10.0, 2.0))
+    second = harness.command(OrbitBehaviour(Orbit(radius_m=10.0, speed_mps=2.0)))
     assert_failed(future.result(), "replaced by ", " orbit")
     harness.run(3.0)
     assert harness.autopilot.requests.count("offboard") == 1
@@ -120,7 +120,7 @@ def test_stop_hands_over_and_stops_streaming() -> None:
 
 def test_brake_is_sent_while_leaving_offboard() -> None:
     harness = GuidanceHarness(flying(), lag_s=0.8)
-    engaged(harness, OrbitBehaviour(10.0, 3.0))
+    engaged(harness, OrbitBehaviour(Orbit(radius_m=10.0, speed_mps=3.0)))
     harness.command(LandBehaviour())
     harness.run(0.4)
     assert harness.autopilot.setpoints[-1].velocity_ned_mps == (0.0, 0.0, 0.0)

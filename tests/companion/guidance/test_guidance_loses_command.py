@@ -3,7 +3,7 @@
 import pytest
 
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import EventKind
 from companion.vehicle.state import FlightMode
@@ -30,7 +30,7 @@ OTHER_MODES = [
 @pytest.mark.parametrize("mode", OTHER_MODES)
 def test_foreign_mode_ends_command_permanently(mode: FlightMode, lag_s: float) -> None:
     harness = GuidanceHarness(flying(), lag_s)
-    future = engaged(harness, OrbitBehaviour())
+    future = engaged(harness, OrbitBehaviour(Orbit()))
     harness.autopilot.change_mode(mode)
     harness.until(lambda: harness.autopilot.state.mode is mode, 2.0)
     sent = len(harness.autopilot.setpoints)
@@ -137,7 +137,7 @@ def test_lost_link_ends_command_without_resuming() -> None:
 
 def test_lost_position_brakes_then_gives_up_command() -> None:
     harness = GuidanceHarness(flying())
-    future = engaged(harness, OrbitBehaviour())
+    future = engaged(harness, OrbitBehaviour(Orbit()))
     harness.autopilot.position_alive = False
     harness.run(1.0)
     assert harness.autopilot.setpoints[-1].velocity_ned_mps == (0.0, 0.0, 0.0)

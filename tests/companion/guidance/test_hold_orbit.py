@@ -6,7 +6,7 @@ import pytest
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
@@ -65,8 +65,8 @@ def test_hold_ends_after_its_duration() -> None:
     assert_succeeded(Flight(HoldBehaviour(duration_s=2.0)).run(3.0), "2 s")
 
 
-@pytest.mark.parametrize("clockwise", [True, False])
-def test_orbit_flies_its_laps_facing_the_centre(clockwise: bool) -> None:
+@pytest.mark.parametrize("direction", ["clockwise", "counterclockwise"])
+def test_orbit_flies_its_laps_facing_the_centre(direction: str) -> None:
     vehicle = KinematicVehicle(yaw_rad=math.pi / 2)
     centre = (0.0, 10.0)
     seen = []
@@ -85,21 +85,20 @@ def test_orbit_flies_its_laps_facing_the_centre(clockwise: bool) -> None:
                 )
             )
 
-    assert_succeeded(
-        Flight(OrbitBehaviour(10.0, 2.0, laps=2.0, clockwise=clockwise), vehicle).run(120.0, each)
-    )
+    orbit = OrbitBehaviour(Orbit(None, 10.0, 2.0, 2.0, direction))
+    assert_succeeded(Flight(orbit, vehicle).run(120.0, each))
     assert all(abs(distance - 10.0) < 0.1 for distance, *_ in seen)
     assert all(abs(speed - 2.0) < 0.2 for _, speed, *_ in seen)
     assert all(off < math.radians(3) for _, _, off, *_ in seen)
     assert all(abs(down + 5.0) < 0.1 for *_, down in seen)
     turned = sum(wrap_angle(b[3] - a[3]) for a, b in itertools.pairwise(seen))
-    assert (turned > 0) is clockwise
+    assert (turned > 0) is (direction == "clockwise")
 
 
 def test_orbit_reaches_a_distant_circle() -> None:
     car = SeenObject("car", 30.0, 4.0)
     vehicle = KinematicVehicle()
-    flight = Flight(OrbitBehaviour(8.0, 3.0, laps=1.0, subject=Subject("car")), vehicle, [car])
+    flight = Flight(OrbitBehaviour(Orbit(Subject("car"), 8.0, 3.0, 1.0)), vehicle, [car])
     # The behaviour begins after the first frame, as its requirement demands.
     flight.latency_s = 0.0
     assert_succeeded(flight.run(90.0))
@@ -107,11 +106,11 @@ def test_orbit_reaches_a_distant_circle() -> None:
 
 
 def test_orbit_without_a_visible_object_ends() -> None:
-    assert_failed(Flight(OrbitBehaviour(subject=Subject("boat"))).run(5.0), "boat")
+    assert_failed(Flight(OrbitBehaviour(Orbit(subject=Subject("boat")))).run(5.0), "boat")
 
 
 def test_orbit_at_its_centre_gives_finite_setpoints() -> None:
-    behaviour = OrbitBehaviour(5.0, 1.0)
+    behaviour = OrbitBehaviour(Orbit(radius_m=5.0, speed_mps=1.0))
     vehicle = KinematicVehicle()
     flight = Flight(behaviour, vehicle)
     flight.run(0.1)

@@ -10,7 +10,7 @@ from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.behaviours.orbit import OrbitBehaviour
+from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import EventKind, GuidanceInput
@@ -69,7 +69,7 @@ def test_no_flight_command_begins(behaviour: Behaviour, identity: Identity) -> N
 @pytest.mark.parametrize("identity", NOT_FLOWN)
 def test_change_of_type_ends_our_command_at_once(identity: Identity) -> None:
     harness = Vehicle(HOVERING)
-    pending = engaged(harness, OrbitBehaviour())
+    pending = engaged(harness, OrbitBehaviour(Orbit()))
     requests, sent = list(harness.autopilot.requests), len(harness.autopilot.setpoints)
     harness.identity = identity
     harness.run()
