@@ -45,9 +45,9 @@ OCCLUDED_S, OCCLUDED_FRAMES, EXPECTED_GATE, DOUBT_S = 0.25, 3, 1.0, 2.0
 # finds some of them twice.
 SAME_BEARING_RAD, ONE_OBJECT_IOU = 0.03, 0.5
 # Where a nearer box covers this share of a box's lower edge or of a side, that edge is not the object's: its
-# position is predicted for so long; after that a moving one has the direction alone. In a share of its own
-# size, a box ends so far from what hides its lower edge, and overlaps more with what hides its side.
-HIDDEN_SHARE, HIDDEN_S, HIDDEN_EDGE = 0.5, 2.0, 0.1
+# position is predicted for so long; after that a moving one has the direction alone. What hides a side
+# overlaps by a share of the box's width; a lower edge ends off what hides it by a share of that one's height.
+HIDDEN_SHARE, HIDDEN_S, HIDDEN_LAP, HIDDEN_GAP = 0.5, 2.0, 0.1, 0.04
 # Without a tracker a detection within this bearing of an object that is not seen otherwise may be it.
 DIRECTION_RAD = 0.1
 # An object without a rival has manoeuvred if the filter has refused its detections this many times in a row
@@ -611,9 +611,9 @@ def _is_hidden(target: Target, frame: Sequence[Target]) -> bool:
         left2, top2, right2, bottom2 = other.box_xyxy
         if not other.trusted or bottom2 <= bottom or _overlap(target, other) >= ONE_OBJECT_IOU:
             continue
-        lap, gap = min(right, right2) - max(left, left2), HIDDEN_EDGE * (bottom2 - top2)
+        lap, gap = min(right, right2) - max(left, left2), HIDDEN_GAP * (bottom2 - top2)
         below = lap > HIDDEN_SHARE * (right - left) and top2 - gap < bottom
-        beside = lap > HIDDEN_EDGE * (right - left) and (left2 <= left or right2 >= right)
+        beside = lap > HIDDEN_LAP * (right - left) and (left2 <= left or right2 >= right)
         if below or (beside and bottom - max(top, top2) > HIDDEN_SHARE * (bottom - top)):
             return True
     return False
