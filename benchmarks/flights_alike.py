@@ -71,7 +71,7 @@ def run(seed: int, *, rendered: bool = False) -> FlightResult:
     log = flight.fly(behaviour, FLIGHT_S, each=judge)
     if not followed:
         return FlightResult(seed, False, {"flown_to_other": 0.0}, "nothing was chosen")
-    # The first second tells which car it began with; a whole one, because crossing cars are near each other.
+    # The first second shows which car it began with; a whole one, because crossing cars are near each other.
     first, last = followed[:20], followed[-20:]
     begun = min((0, 1), key=lambda which: float(np.median([each[which] for each in first])))
     to_chosen_m, to_other_m = (
