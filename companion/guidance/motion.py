@@ -35,9 +35,9 @@ HOLD_INTEGRAL_MPS = 0.5
 HOLD_INTEGRAL_M = 1.0
 # `VelocityBias`: natural frequency and damping of the observer, and the limits of its result and its error.
 BIAS_FREQUENCY_RADPS, BIAS_DAMPING = 2.4, 0.8
-# A larger error is a jump of the estimate, and telemetry was missing for longer than the gap: the observer
-# starts again.
-MAX_BIAS_MPS, MAX_BIAS_ERROR_M, MAX_BIAS_GAP_S = 0.8, 0.5, 0.5
+# A larger error is a jump of the estimate: the observer starts again, as after a gap of the telemetry, above
+# which it would not be stable.
+MAX_BIAS_MPS, MAX_BIAS_ERROR_M, MAX_BIAS_GAP_S = 0.8, 0.5, 0.3
 # Arrived: within this distance of the goal and slower than this...
 ARRIVED_M = 0.3
 ARRIVED_MPS = 0.3
@@ -206,7 +206,8 @@ class VelocityBias:
 
     def __init__(self) -> None:
         self._stamp_ns = 0
-        self._predicted_m: tuple[float, float] | None = None
+        # Of the stamp: the predicted position, and the estimated velocity.
+        self._predicted: tuple[tuple[float, float], Vector3] | None = None
         self._bias_mps = (0.0, 0.0)
 
     @property
@@ -221,18 +222,20 @@ class VelocityBias:
         # An estimate that drifts before or at lift-off is no reason to lean there.
         flies = state.landed not in (LandedState.ON_GROUND, LandedState.TAKING_OFF)
         if position is None or velocity is None or not flies or not 0.0 <= dt_s <= MAX_BIAS_GAP_S:
-            self._predicted_m, self._bias_mps = None, (0.0, 0.0)
+            self._predicted, self._bias_mps = None, (0.0, 0.0)
             return
-        predicted = self._predicted_m or position[:2]
+        if self._predicted is None:
+            self._predicted = position[:2], velocity
+            return
+        predicted = [
+            p + (0.5 * (before + v) + b) * dt_s
+            for p, before, v, b in zip(*self._predicted, velocity, self._bias_mps, strict=False)
+        ]
         error = (position[0] - predicted[0], position[1] - predicted[1])
         if math.hypot(*error) > MAX_BIAS_ERROR_M:
-            predicted, error, self._bias_mps = position[:2], (0.0, 0.0), (0.0, 0.0)
-        gain = 2.0 * BIAS_DAMPING * BIAS_FREQUENCY_RADPS
-        north, east = (
-            p + (v + b + gain * e) * dt_s
-            for p, v, b, e in zip(predicted, velocity, self._bias_mps, error, strict=False)
-        )
-        self._predicted_m = (north, east)
+            predicted, error, self._bias_mps = [*position[:2]], (0.0, 0.0), (0.0, 0.0)
+        gain = 2.0 * BIAS_DAMPING * BIAS_FREQUENCY_RADPS * dt_s
+        self._predicted = (predicted[0] + gain * error[0], predicted[1] + gain * error[1]), velocity
         bias = [b + BIAS_FREQUENCY_RADPS**2 * e * dt_s for b, e in zip(self._bias_mps, error, strict=True)]
         shorten = min(1.0, MAX_BIAS_MPS / max(math.hypot(*bias), 1e-6))
         self._bias_mps = (bias[0] * shorten, bias[1] * shorten)
