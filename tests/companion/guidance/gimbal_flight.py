@@ -33,9 +33,10 @@ def gimbal_flight(
     mount: CameraMount = ON_GIMBAL,
     rate_hz: float = 5.0,
     wind_mps: float = 0.0,
+    noise: float = 1.0,
 ) -> LockstepFlight:
-    """In the air, with a detector that sees the objects through the gimbal's camera."""
-    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=wind_mps, gimbal=True)
+    """In the air; a detector sees the objects through the gimbal's camera. noise: of the estimate."""
+    vehicle = in_the_air(seed=seed, height_m=HEIGHT_M, wind_mps=wind_mps, noise=noise, gimbal=True)
 
     def gimbal_attitude() -> Quaternion:
         gimbal = vehicle.vehicle.gimbal
