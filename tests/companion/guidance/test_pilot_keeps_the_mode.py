@@ -165,14 +165,21 @@ class PilotedFlight:
         self._changed_s: float | None = None
         driver = self.flight.driver
         assert isinstance(driver, SimulatedDriver)
-        on_report = driver._changes.on_report
+        on_report, step = driver._changes.on_report, driver.step
 
         def note(state: VehicleState, now_ns: int, answered_ns: int) -> None:
             if self.reported[-1:] != [state.mode]:
                 self.reported.append(state.mode)
             on_report(state, now_ns, answered_ns)
 
+        def watched(dt_s: float) -> None:
+            step(dt_s)
+            changed = self._changed_s is not None and vehicle.truth.mode not in PILOTS
+            if changed and self.overridden_s is None:
+                self.overridden_s = vehicle.now_s - (self._changed_s or 0.0)
+
         driver._changes.on_report = note  # type: ignore[method-assign]
+        driver.step = watched  # type: ignore[method-assign]
 
     def fly(self, pilot_s: float) -> str:
         """The pilot changes the mode so long after the request; 0: just before it. Returns the last mode."""
@@ -200,10 +207,6 @@ class PilotedFlight:
     def _run(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.01)):
             self.flight.tick()
-            vehicle = self.flight.vehicle
-            changed = self._changed_s is not None and vehicle.truth.mode not in PILOTS
-            if changed and self.overridden_s is None:
-                self.overridden_s = vehicle.now_s - (self._changed_s or 0.0)
 
 
 def moments(sender: str, fault: str, every_s: float) -> list[float]:
