@@ -277,7 +277,7 @@ class LandOnMarkerBehaviour(Behaviour):
         if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
             why = f" ({context.markers.fault})" if context.markers.fault else ""
             return self._climb(f"lost {self._height_m:.1f} m above it{why}", context, position)
-        point, drift = pad.at(now_ns), pad.velocity_mps
+        point, drift = pad.at(now_ns), pad.velocity_at(now_ns)
         error_m = math.dist(point[:2], position[:2])
         if self._height_m <= FINAL_M:
             self._waiting_s += dt_s
@@ -310,7 +310,7 @@ class LandOnMarkerBehaviour(Behaviour):
     def _finishing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns, pad = context.now_ns, self._pad
         assert pad is not None
-        point, drift = pad.at(now_ns), pad.velocity_mps
+        point, drift = pad.at(now_ns), pad.velocity_at(now_ns)
         error_m = math.dist(point[:2], position[:2])
         seen = pad.unseen_s(now_ns) < WAIT_AFTER_S
         if seen and error_m > MISSED_M and self._height_m > MISSED_HEIGHT_M and not self._touching:
@@ -343,7 +343,7 @@ class LandOnMarkerBehaviour(Behaviour):
             self._begin_search(context, position)
             return self._searching(dt_s, context, position)
         point = position if pad is None else pad.at(now_ns)
-        drift = (0.0, 0.0) if pad is None else pad.velocity_mps
+        drift = (0.0, 0.0) if pad is None else pad.velocity_at(now_ns)
         if self._unseen_s(now_ns) > 2 * LOST_AFTER_S:
             point, drift = position, (0.0, 0.0)
         return self._to(point, context, position, drift, -CLIMB_MPS)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from companion.guidance.objects.from_detections import HistoryError, StateHistory
 from companion.guidance.objects.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
-from companion.guidance.objects.pad_filter import PadFilter
+from companion.guidance.objects.pad_filter import DRIFT_S, PadFilter
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.guidance_harness import known
 from vision.attitude import quaternion_from_euler, wrap_angle
@@ -159,17 +159,19 @@ def test_single_outlier_is_rejected_and_many_restart() -> None:
     assert pad.at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_moving_pad_is_predicted_and_a_static_one_is_not() -> None:
+def test_moving_pad_is_predicted_and_a_static_one_for_a_moment() -> None:
     rng = np.random.default_rng(4)
     for moving in (True, False):
         pad = PadFilter(pad_detection(0.0, 1.0), moving=moving)
         for step in range(1, 80):
             pad.add(pad_detection(0.5 * step * 0.05 + rng.normal(0.0, 0.03), 1.0 + step * 0.05))
-        if moving:
-            assert pad.velocity_mps[0] == pytest.approx(0.5, abs=0.12)
-            assert pad.at(round(5.45e9))[0] == pytest.approx(0.5 * 4.45, abs=0.15)
-        else:
-            assert pad.velocity_mps == (0.0, 0.0)
+        last_s, unseen_s = 1.0 + 79 * 0.05, 2.0
+        assert pad.velocity_at(round(last_s * 1e9))[0] == pytest.approx(0.5, abs=0.12)
+        assert pad.at(round((last_s + 0.5) * 1e9))[0] == pytest.approx(0.5 * 4.45, abs=0.15)
+        later_ns = round((last_s + unseen_s) * 1e9)
+        ahead_s = unseen_s if moving else DRIFT_S
+        assert pad.at(later_ns)[0] == pytest.approx(0.5 * (3.95 + ahead_s), abs=0.3)
+        assert (pad.velocity_at(later_ns) != (0.0, 0.0)) is moving
 
 
 def test_old_detections_are_ignored() -> None:

@@ -116,7 +116,7 @@ def test_without_sweep_it_is_not_found() -> None:
 def test_directions_and_positions_while_gimbal_and_yaw_turn() -> None:
     """Searches for another class, so that the sweep does not stop; wind tilts the vehicle."""
     scene_object = person(60.0)
-    _, log, seen = fly("seek car sweep=-60 laps=1", scene_object, rate_hz=10.0, wind_mps=3.0)
+    _, log, seen = fly("seek car sweep=-60 laps=1", scene_object, rate_hz=10.0, wind_mps=3.0, noise=0.0)
     assert_failed(log.outcome, "found in 1 lap")
     assert pitches(log)[-1] == pytest.approx(pitches(log)[0], abs=5.0), "returned to the initial pitch"
     assert min(pitches(log)) == pytest.approx(-60.0, abs=5.5)

@@ -172,7 +172,7 @@ def test_simulated_vehicle_does_what_the_function_says(
     release: str, act: int, lost_act: int, sticks: bool
 ) -> None:
     parameters = {"COM_OBL_RC_ACT": act, "NAV_RCL_ACT": lost_act, "COM_OF_LOSS_T": 0.7}
-    vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=3, px4=release, parameters=parameters)
+    vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=3, noise=0.0, px4=release, parameters=parameters)
     vehicle.take_off(12.0, limit_s=90.0)
     vehicle.vehicle.autopilot.pilot_has_sticks = sticks
     driver = SimulatedDriver(vehicle)
