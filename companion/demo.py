@@ -22,6 +22,7 @@ from companion.dashboard.process import dashboard_process
 from companion.service import Event, Service
 from companion.service.ending import EndedError, until_ended
 from companion.sim_session import (
+    DEMO_NOISE,
     FIND,
     MISSION,
     RANGE_TOLERANCE_M,
@@ -145,6 +146,7 @@ async def _fly(
         camera_rate_hz=_CAMERA_RATE_HZ,
         truth_path=truth_path,
         log_path=output / "simulator.log",
+        noise=DEMO_NOISE,
     )
     opened = simulator(options) if vehicle_url is None else camera_of_autopilot(vehicle_url, options)
     rate_hz = _CAMERA_RATE_HZ if has_pyav() else _SLOW_VIDEO_RATE_HZ

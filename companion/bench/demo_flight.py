@@ -23,6 +23,7 @@ from companion.campaign import map_seeds
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.settings import Settings
 from companion.sim_session import (
+    DEMO_NOISE,
     FIND,
     MISSION,
     RANGE_TOLERANCE_M,
@@ -79,7 +80,9 @@ def fly_demo(seed: int, *, synthetic: bool = False) -> DemoFlight:
     # The precision `auto` is measured, and may be another one on another machine.
     chosen = Settings.model_validate({"detector": {"precision": "float32"}})
     settings = with_lens(session_settings(14540, "lockstep", chosen=chosen), scene.camera)
-    vehicle = LockstepVehicle({"onboard": RATES_HZ}, seed=seed, parameters=dict(SIMULATOR_PARAMETERS))
+    vehicle = LockstepVehicle(
+        {"onboard": RATES_HZ}, seed=seed, noise=DEMO_NOISE, parameters=dict(SIMULATOR_PARAMETERS)
+    )
     camera: Camera
     if synthetic:
         camera = _synthetic_camera(settings, scene, seed)
