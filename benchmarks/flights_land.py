@@ -156,6 +156,19 @@ class Pad:
         placed: NDArray[np.float64] = corners + np.array([*self.centre_of(identifier, seconds), 0.0])
         return placed
 
+    def plates(self) -> tuple[WorldObject, ...]:
+        """Its printed markers as objects of a world, where they begin."""
+        return tuple(
+            WorldObject(
+                number,
+                "plate",
+                (*self.centre_of(identifier, 0.0), 0.0),
+                self.yaw_rad,
+                printed=Print(DICTIONARY, identifier, size_m),
+            )
+            for number, (identifier, size_m) in enumerate(SIZES_M.items())
+        )
+
 
 class ProjectedCamera:
     """Corners put where geometry has them, with noise; frames get lost."""
@@ -192,17 +205,7 @@ class DrawnCamera:
     """Images of the pad, drawn and searched."""
 
     def __init__(self, pad: Pad, mount: CameraMount) -> None:
-        plates = tuple(
-            WorldObject(
-                number,
-                "plate",
-                (*pad.centre_of(identifier, 0.0), 0.0),
-                pad.yaw_rad,
-                printed=Print(DICTIONARY, identifier, size_m),
-            )
-            for number, (identifier, size_m) in enumerate(SIZES_M.items())
-        )
-        self._renderer = Renderer(World(plates, Ground(("concrete",), 3, 512, 0.05)), CAMERA, mount)
+        self._renderer = Renderer(World(pad.plates(), Ground(("concrete",), 3, 512, 0.05)), CAMERA, mount)
         self._detector = MarkerDetector(MarkerKind(DICTIONARY, SIZES_M[MIDDLE], SIZES_M))
 
     def look(self, truth: Truth, seconds: float) -> tuple[Marker, ...] | None:

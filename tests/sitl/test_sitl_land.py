@@ -23,8 +23,7 @@ from benchmarks.flights_land import (
 )
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.simulated_camera import SimulatedCamera
-from mavlink_sim.world.fiducials import Print
-from mavlink_sim.world.world import Ground, World, WorldObject
+from mavlink_sim.world.world import Ground, World
 from tests.companion.service_process import running_service
 from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import READY_S, AutopilotLink, Flight, Truth, bring_down, repeated, true_poses
@@ -41,18 +40,8 @@ SETTLED_S = 1.0
 
 def frames(pad: Pad, truth: Truth, writer: SharedFrameWriter) -> Iterator[None]:
     """Draw the pad from the true pose, and share the image `LATENCY_S` later."""
-    plates = tuple(
-        WorldObject(
-            number,
-            "plate",
-            (*pad.centre_of(marker, 0.0), 0.0),
-            pad.yaw_rad,
-            printed=Print(DICTIONARY, marker, size_m),
-        )
-        for number, (marker, size_m) in enumerate(SIZES_M.items())
-    )
     lens = CameraSettings(model=CAMERA, mount=MOUNT)
-    camera = SimulatedCamera(Scene(World(plates, Ground(("concrete",), 5, 256, 0.05)), {}, lens, "pad"))
+    camera = SimulatedCamera(Scene(World(pad.plates(), Ground(("concrete",), 5, 256, 0.05)), {}, lens, "pad"))
     while True:
         captured_s = time.monotonic() - LATENCY_S
         time_s, pose = min(truth.poses[-50:], key=lambda item: abs(item[0] - captured_s))
