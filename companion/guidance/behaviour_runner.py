@@ -221,8 +221,9 @@ class BehaviourRunner:
                 if step != self._modes.requested:
                     self._modes.start_request(step, context)
             case Setpoint() if self._modes.phase is Phase.OFFBOARD:
-                asked = self._velocity_bias.command(step)
-                self._setpoints.limit(asked, context, dt_s, behaviour.name, landing=self._landing)
+                self._setpoints.limit(
+                    step, seen, dt_s, behaviour.name, self._velocity_bias, landing=self._landing
+                )
             case Setpoint():
                 if self._modes.phase is not Phase.ENGAGING:
                     self._modes.start_engaging(context, sent_count)

@@ -121,7 +121,7 @@ class Guidance:
 
     @property
     def asked(self) -> Setpoint | None:
-        """The last setpoint of a behaviour, its velocity corrected (`VelocityBias`); None: none is active."""
+        """The last setpoint of a behaviour; None: none is active."""
         return self._setpoints.asked
 
     @property

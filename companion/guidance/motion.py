@@ -246,11 +246,13 @@ class VelocityBias:
             return state
         return with_fields(state, velocity_ned_mps=self._plus(state.velocity_ned_mps, 1.0))
 
-    def command(self, setpoint: Setpoint) -> Setpoint:
-        """The setpoint that changes the position at a setpoint's velocity."""
+    def command(self, setpoint: Setpoint, top_mps: float) -> Setpoint:
+        """The setpoint that changes the position at a setpoint's velocity; horizontally at most `top_mps`."""
         if setpoint.velocity_ned_mps is None or self._bias_mps == (0.0, 0.0):
             return setpoint
-        return replace(setpoint, velocity_ned_mps=self._plus(setpoint.velocity_ned_mps, -1.0))
+        north, east, down_mps = self._plus(setpoint.velocity_ned_mps, -1.0)
+        shorten = min(1.0, top_mps / max(math.hypot(north, east), 1e-6))
+        return replace(setpoint, velocity_ned_mps=(shorten * north, shorten * east, down_mps))
 
     def _plus(self, velocity_ned_mps: Vector3, share: float) -> Vector3:
         north_mps, east_mps, down_mps = velocity_ned_mps

@@ -11,6 +11,7 @@ from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoi
 from companion.guidance.interface import EventKind, OutputCollector
 from companion.guidance.limits.envelope import Envelope, Limits, within_autopilot
 from companion.guidance.limits.obstacles import Constraint, ObstacleMemory, ObstacleRules
+from companion.guidance.motion import VelocityBias
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
@@ -28,7 +29,8 @@ class SetpointOutput:
     Attributes:
         streaming: setpoints are sent.
         asked: the last setpoint of a behaviour; None: none is active.
-        sent: the last setpoint after the envelope, or the brake that is streamed while a mode is requested.
+        sent: the last setpoint after the envelope, its velocity corrected by `VelocityBias`, or the brake
+            that is streamed while a mode is requested.
         limited_by: names of the limits that changed `sent`.
         path: (north, east) points of the active path around obstacles; empty: none.
         blind: the vehicle brakes because depth is missing, which was reported.
@@ -103,9 +105,19 @@ class SetpointOutput:
         return step
 
     def limit(
-        self, setpoint: Setpoint, context: BehaviourContext, dt_s: float, behaviour: str, *, landing: bool
+        self,
+        setpoint: Setpoint,
+        context: BehaviourContext,
+        dt_s: float,
+        behaviour: str,
+        bias: VelocityBias,
+        *,
+        landing: bool,
     ) -> None:
-        """Send a setpoint after the envelope; a brake where required depth is missing."""
+        """Send a setpoint after the envelope; a brake where required depth is missing.
+
+        The envelope limits how the position changes: the command that the autopilot needs for it follows.
+        """
         # The lifetime is the operator's setting, not the behaviour's.
         asked = replace(setpoint, deadline_ns=context.now_ns + round(self._lifetime_s * 1e9))
         blind = self._obstacles.blind(context) if self._uses_depth(context) else None
@@ -116,9 +128,10 @@ class SetpointOutput:
             return
         self._envelope.obstacle_constraints = self._obstacle_constraints(context)
         self.asked = asked
-        self.sent, self.limited_by = self._envelope.apply(
+        limited, self.limited_by = self._envelope.apply(
             asked, context.state, context.now_ns, dt_s, context.neighbours, landing=landing
         )
+        self.sent = bias.command(limited, self.limits.max_horizontal_speed_mps)
 
     def check_goals(self, goals: Sequence[Vector3], state: VehicleState) -> str | None:
         """Why a goal is outside the limits, in words; None: none is. One with a NaN is not checked."""

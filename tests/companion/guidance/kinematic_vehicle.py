@@ -16,7 +16,11 @@ START_NS = 1_000_000_000_000
 
 @dataclass
 class KinematicVehicle:
-    """Local NED. First-order lag of velocity and yaw rate, like a multirotor's outer loops."""
+    """Local NED. First-order lag of velocity and yaw rate, like a multirotor's outer loops.
+
+    Attributes:
+        velocity_error: of the estimated velocity, which is the one that setpoints set.
+    """
 
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, -5.0])
     velocity: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -27,6 +31,7 @@ class KinematicVehicle:
     armed: bool = True
     landed: LandedState = LandedState.IN_AIR
     lag_s: float = 0.3
+    velocity_error: Vector3 = (0.0, 0.0, 0.0)
 
     @property
     def state(self) -> VehicleState:
@@ -39,11 +44,16 @@ class KinematicVehicle:
             landed=self.landed,
             ready_to_arm=True,
             position_ned_m=self.position_ned_m,
-            velocity_ned_mps=(self.velocity[0], self.velocity[1], self.velocity[2]),
+            velocity_ned_mps=self.estimated_velocity,
             attitude=quaternion_from_euler(0.0, 0.0, self.yaw_rad),
             home_altitude_amsl_m=489.0,
             home_position_ned_m=(0.0, 0.0, 0.0),
         )
+
+    @property
+    def estimated_velocity(self) -> Vector3:
+        north, east, down = (v + e for v, e in zip(self.velocity, self.velocity_error, strict=True))
+        return (north, east, down)
 
     @property
     def position_ned_m(self) -> Vector3:
@@ -60,7 +70,7 @@ class KinematicVehicle:
             rate = max(-1.5, min(1.5, 2.0 * wrap_angle(setpoint.yaw_rad - self.yaw_rad)))
         mix = dt_s / (self.lag_s + dt_s)
         for axis in range(3):
-            self.velocity[axis] += (wanted[axis] - self.velocity[axis]) * mix
+            self.velocity[axis] += (wanted[axis] - self.estimated_velocity[axis]) * mix
             self.position[axis] += self.velocity[axis] * dt_s
         self.yaw_rate_radps += (rate - self.yaw_rate_radps) * dt_s / (0.15 + dt_s)
         self.yaw_rad = wrap_angle(self.yaw_rad + self.yaw_rate_radps * dt_s)

@@ -196,6 +196,26 @@ def test_brake_is_sent_while_depth_is_missing() -> None:
     assert "depth" in harness.events[-1].message
 
 
+@pytest.mark.parametrize("error_mps", [0.0, -0.5, 0.5])
+def test_wrong_velocity_estimate_does_not_pass_the_margin(error_mps: float) -> None:
+    """The velocity estimate of a PX4 errs by half a metre per second for seconds, its position does not."""
+    vehicle = KinematicVehicle(mode=FlightMode.HOLD, velocity_error=(error_mps, 0.0, 0.0))
+
+    def wall() -> ObstacleSectors:
+        away_m = 15.0 - vehicle.position[0]
+        return sectors(vehicle.now_ns, {i: away_m / math.cos(math.radians(5 * i)) for i in range(-8, 9)})
+
+    harness = GuidanceHarness(
+        vehicle,
+        options=GuidanceOptions(obstacles=ObstacleRules("required", margin_m=2.0)),
+        inputs=lambda inputs: replace(inputs, obstacles=wall()),
+    )
+    harness.run(0.1)
+    harness.command(GotoBehaviour(Goto(forward_m=30.0, right_m=0.0)))
+    harness.run(40.0)
+    assert 12.5 < vehicle.position[0] < 13.1
+
+
 def test_obstacle_outside_the_image_is_remembered() -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
     memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle), MARGIN_M)

@@ -7,9 +7,16 @@ from dataclasses import replace
 
 import pytest
 
+from companion.geometry.fence import Fence
+from companion.guidance.behaviour import BehaviourContext
+from companion.guidance.interface import OutputCollector
+from companion.guidance.limits.envelope import Limits
+from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.motion import MAX_BIAS_MPS, VelocityBias
+from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import LandedState, VehicleState
+from companion.vehicle.state import LandedState, Vector3, VehicleState
+from tests.companion.guidance.test_obstacles import sectors
 
 STEP_NS = 50_000_000
 VELOCITY_MPS = (3.0, -1.0, 0.2)
@@ -108,8 +115,48 @@ def test_state_and_setpoint_are_corrected_oppositely() -> None:
     assert fitting.velocity_ned_mps == pytest.approx((3.2, -1.1, 0.2), abs=0.01)
     assert fitting.position_ned_m == (0.0, 0.0, -5.0)
     wanted = Setpoint.velocity((1.0, 0.0, -0.5), BEGIN_NS, yaw_rad=1.0)
-    command = bias.command(wanted)
+    command = bias.command(wanted, 5.0)
     assert command.velocity_ned_mps == pytest.approx((0.8, 0.1, -0.5), abs=0.01)
     assert command.yaw_rad == 1.0
     place = Setpoint.position((1.0, 2.0, -5.0), BEGIN_NS)
-    assert bias.command(place) is place
+    assert bias.command(place, 5.0) is place
+
+
+def test_command_is_at_most_the_greatest_speed() -> None:
+    fast = after(4.0).command(Setpoint.velocity((-3.0, 0.0, -0.5), BEGIN_NS), 3.0)
+    assert fast.velocity_ned_mps is not None
+    north_mps, east_mps, down_mps = fast.velocity_ned_mps
+    assert math.hypot(north_mps, east_mps) == pytest.approx(3.0)
+    assert down_mps == -0.5
+
+
+@pytest.mark.parametrize(
+    ("limits", "near"),
+    [
+        (Limits(max_distance_m=21.0), None),
+        (Limits(fence=Fence(include=((-9.0, -9.0), (21.0, -9.0), (21.0, 9.0), (-9.0, 9.0)))), None),
+        (Limits(), {0: 3.0}),
+    ],
+    ids=["distance from home", "fence", "obstacle"],
+)
+def test_limits_hold_for_how_the_position_changes(limits: Limits, near: dict[int, float] | None) -> None:
+    """Of two vehicles that move alike, one with a wrong velocity estimate, both go on moving alike."""
+    bias = after(4.0)
+    wrong = state(20.0, 0.0, BEGIN_NS)
+
+    def sent(seen: VehicleState, by: VelocityBias) -> Vector3:
+        output = SetpointOutput(limits, ObstacleRules("auto", 1.0), 1.0, OutputCollector())
+        at = BehaviourContext(
+            now_ns=BEGIN_NS, state=seen, obstacles=None if near is None else sectors(BEGIN_NS, near)
+        )
+        asked = Setpoint.velocity((4.0, 0.0, 0.0), BEGIN_NS)
+        output.limit(asked, at, 0.05, "goto", by, landing=False)
+        assert output.sent is not None
+        assert output.limited_by
+        assert output.sent.velocity_ned_mps is not None
+        return output.sent.velocity_ned_mps
+
+    right = bias.fitting(replace(wrong, home_position_ned_m=(0.0, 0.0, 0.0)))
+    assert sent(right, VelocityBias())[0] < 2.0
+    corrected = [one + b for one, b in zip(sent(right, bias)[:2], bias.north_east_mps, strict=True)]
+    assert corrected == pytest.approx(sent(right, VelocityBias())[:2], abs=1e-6)
