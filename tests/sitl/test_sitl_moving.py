@@ -24,15 +24,26 @@ height = 300
 [[objects]]
 class = "car"
 appearance = 5
-path = {{ waypoints_m = {waypoints}, speed_mps = {speed}, repeat = "{repeat}" }}
+path = {{ {path} }}
 """
 SQUARE = "[[12.0, 6.0], [24.0, 6.0], [24.0, -6.0], [12.0, -6.0]]"
 LINE = "[[14.0, -6.0], [14.0, 6.0]]"
+SPEED_MPS, STOP_S = 3.0, 4.0
+
+
+def stops(*corners_m: tuple[float, float]) -> list[list[float]]:
+    """A path with a stop at each corner: there the car moves to and fro by a centimetre."""
+    to_and_fro = round(STOP_S * SPEED_MPS / 0.02)
+    return [[north, east + by] for north, east in corners_m for by in (0.0, 0.01) * to_and_fro]
+
+
 PATHS = {
-    "right angles": (SQUARE, 1.5, "loop"),
-    "right angles, fast": (SQUARE, 3.0, "loop"),
-    "back": (LINE, 1.5, "back_and_forth"),
-    "stops": ("[[14.0, -6.0], [14.0, 12.0]]", 3.0, "once"),
+    "right angles": f'waypoints_m = {SQUARE}, speed_mps = 1.5, repeat = "loop"',
+    "right angles, fast": f'waypoints_m = {SQUARE}, speed_mps = {SPEED_MPS}, repeat = "loop"',
+    "back": f'waypoints_m = {LINE}, speed_mps = 1.5, repeat = "back_and_forth"',
+    "a stop": f'waypoints_m = [[14.0, -6.0], [14.0, 12.0]], speed_mps = {SPEED_MPS}, repeat = "once"',
+    "stops and starts": f"waypoints_m = {stops((14.0, -6.0), (14.0, 9.0))}, speed_mps = {SPEED_MPS}, "
+    'repeat = "back_and_forth", yaw_deg = 90.0',
 }
 
 
@@ -44,9 +55,8 @@ def test_car_that_turns_at_once_is_kept_for_a_minute(
     link: AutopilotLink, services: Services, tmp_path: Path, command: str, path: str
 ) -> None:
     make_ready(link, services)
-    waypoints, speed, repeat = PATHS[path]
     scene = tmp_path / "car.toml"
-    scene.write_text(SCENE.format(waypoints=waypoints, speed=speed, repeat=repeat))
+    scene.write_text(SCENE.format(path=PATHS[path]))
     flags = ["--vehicle-url", f"udpin://127.0.0.1:{link.service_port}", "--scene", str(scene)]
     flags += ["--guidance-min-battery-percent", "0", "--guidance-obstacles", "off"]
     flags += ["--detector-image-size", "320", "--detector-threads", "1"]
