@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from companion.guidance.objects.estimate import UNSTATED_SIGMA
+from companion.guidance.objects.position_filter import UNSTATED_SIGMA
 from companion.guidance.objects.target import Target
 from companion.vehicle.state import Vector3
 

@@ -17,8 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from companion.geometry.gate import GATE
-from companion.guidance.objects.estimate import Estimate, Fit
-from companion.guidance.objects.position_filter import PositionFilter
+from companion.guidance.objects.position_filter import Estimate, Fit, PositionFilter
 from companion.guidance.objects.target import RangeSource, Target
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.state import Vector3

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from companion.guidance.objects.estimate import acceleration_noise, largest_sigma
 from companion.guidance.objects.from_markers import marker_name
-from companion.guidance.objects.position_filter import STALE_S
+from companion.guidance.objects.position_filter import STALE_S, largest_sigma, predicted_covariance
 from companion.guidance.objects.target import DOUBTED, UNCONFIRMED_MARKER, RangeSource, Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
@@ -112,11 +110,8 @@ class TrackedObject:
 
     def ellipse_at(self, now_ns: int) -> ErrorEllipse:
         """The horizontal error of `position_at`."""
-        elapsed_s = self.unseen_s(now_ns)
-        move = np.eye(4)
-        move[0, 2] = move[1, 3] = elapsed_s
-        covariance: NDArray[np.float64] = move @ np.array(self.covariance) @ move.T
-        return ErrorEllipse.of((covariance + acceleration_noise(elapsed_s))[:2, :2])
+        covariance = predicted_covariance(np.array(self.covariance), self.unseen_s(now_ns))
+        return ErrorEllipse.of(covariance[:2, :2])
 
 
 @dataclass(frozen=True, slots=True)
