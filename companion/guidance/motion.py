@@ -13,6 +13,8 @@ from companion.vehicle.state import LandedState, Vector3, VehicleState, with_fie
 GLOBAL_MAX_AGE_S = 0.5
 # Gain from position error to velocity, 1/s: about PX4's own MPC_XY_P and MPC_Z_P.
 POSITION_GAIN = 0.9
+# Above this speed a vehicle that is to stand brakes before it holds its position, else it would fly back.
+STANDING_MPS = 0.5
 # Extra velocity commanded per m/s of velocity error.
 VELOCITY_GAIN = 0.5
 # Limit of drift corrections.
@@ -94,11 +96,6 @@ def towards(
     distance = math.hypot(north, east)
     scale = min(gain, limit_mps / distance) if distance > 1e-6 else 0.0
     return (north * scale, east * scale)
-
-
-def stay_at(point: Vector3, position: Vector3) -> Vector3:
-    """Velocity that keeps the vehicle at a point (for setpoints that also carry a yaw rate)."""
-    return (*towards(point, position, POSITION_GAIN), correction(point[2] - position[2]))
 
 
 def add_velocity_error(
@@ -193,6 +190,33 @@ class PositionController:
         self._down_integral_mps = max(-HOLD_INTEGRAL_MPS, min(HOLD_INTEGRAL_MPS, integral)) if near else 0.0
         asked = wanted + HOLD_DOWN_VELOCITY_GAIN * (wanted - down_mps) + self._down_integral_mps
         return max(-top_speed_mps, min(top_speed_mps, asked))
+
+
+class Standing:
+    """Brakes, then holds where the vehicle comes to rest.
+
+    Attributes:
+        point: held, local NED metres; None: it still brakes.
+    """
+
+    def __init__(self, point: Vector3 | None = None) -> None:
+        self.point = point
+        self._controller = PositionController()
+
+    def velocity(self, state: VehicleState, dt_s: float) -> Vector3:
+        """The velocity command, local NED m/s; arguments and errors as of `PositionController.velocity`."""
+        if self.point is None and speed_of(state) < STANDING_MPS:
+            self.point = stopping_point(state)
+        if self.point is None:
+            # Opposes the motion: PX4's integral would carry the vehicle on for seconds.
+            return (*add_velocity_error((0.0, 0.0), state, ground_speed(state), HOLD_VELOCITY_GAIN), 0.0)
+        return self._controller.velocity(self.point, state, dt_s)
+
+    def setpoint(self, state: VehicleState, now_ns: int, dt_s: float, yaw_rad: float | None) -> Setpoint:
+        """The same as a setpoint. `yaw_rad`: of the nose; None: it does not turn."""
+        rate_radps = 0.0 if yaw_rad is None else None
+        velocity = self.velocity(state, dt_s)
+        return Setpoint.velocity(velocity, now_ns, yaw_rad=yaw_rad, yaw_rate_radps=rate_radps)
 
 
 class VelocityBias:

@@ -37,13 +37,11 @@ from companion.guidance.motion import (
     STOPPING_MPS2,
     Arrival,
     PositionController,
+    Standing,
     add_velocity_error,
     correction,
-    ground_speed,
     position_and_yaw,
     speed_of,
-    stay_at,
-    stopping_point,
     stopping_speed,
 )
 from companion.guidance.objects.closing_check import Approached
@@ -57,8 +55,6 @@ from vision.attitude import wrap_angle
 
 # Retreat from an object that is too near: slow, because the camera does not look backwards.
 MAX_RETREAT_MPS = 1.0
-# Slower than this the vehicle counts as stopped after losing its object.
-STANDING_MPS = 0.3
 # The end of the approach is flown to a fixed point before the object, so that wind does not carry the vehicle
 # around it. Within the first distance of that point it is fixed; beyond the second it is released.
 ANCHOR_M = (1.5, 3.0)
@@ -88,7 +84,6 @@ class _Search:
 
     why: str
     lost_at: Vector3
-    hold_point: Vector3
     begun_ns: int
     pointed_ns: int | None = None
     seek: SeekBehaviour | None = None
@@ -159,7 +154,7 @@ class ApproachBehaviour(Behaviour):
         self._started_ns, self._down_m = now_ns, down_m
         self._until_ns = now_ns + BASE_TIMEOUT_S * 1e9
         self._bearing_rad: float | None = None
-        self._wait_point: Vector3 | None = None
+        self._standing: Standing | None = None
         self._anchor_rad: float | None = None
         self._arrival, self._controller = Arrival(), PositionController()
         self._range_m = math.nan
@@ -199,9 +194,8 @@ class ApproachBehaviour(Behaviour):
         lost_s = self._command.lost_timeout_s if context.avoiding else LOST_AFTER_S
         blind = context.objects.fault_of(self.subject)
         if track is None or track.unseen_s(now_ns) > lost_s or blind:
-            return self._wait(dt_s, context, position)
-        if self._wait_point is not None:
-            self._wait_point, self._controller = None, PositionController()
+            return self._wait(dt_s, context)
+        self._standing = None
 
         bearing = math.atan2(east - position[1], north - position[0])
         if self._range_m > MIN_YAW_RANGE_M or self._bearing_rad is None:
@@ -249,7 +243,7 @@ class ApproachBehaviour(Behaviour):
             return f"lost {self.subject.phrase}, searching {doing} ({self._tried} of {self._retries})"
         if self._object is None:
             return f"looking for {self.subject.phrase}"
-        if self._wait_point is not None:
+        if self._standing is not None:
             return f"lost {self.subject.phrase_now(self._object.track_id)}, waiting"
         return f"{self.subject.phrase_now(self._object.track_id)} {self._range_m:.1f} m away"
 
@@ -291,24 +285,16 @@ class ApproachBehaviour(Behaviour):
         self._anchor_rad = None
         self._arrival, self._controller = Arrival(), PositionController()
 
-    def _wait(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
+    def _wait(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Object not seen: brake, hold where the vehicle comes to rest, and keep the heading."""
-        if self._wait_point is None:
+        if self._standing is None:
             self._leave_goal()
+            self._standing = Standing()
         if (why := context.objects.lost(self.subject, self._command.lost_timeout_s)) is not None:
             if self._object is None or context.objects.fault_of(self.subject):
                 return Outcome(False, why)
             return self._look_again(why, self._object.position_at(context.now_ns), context)
-        if self._wait_point is None and ground_speed(context.state) < STANDING_MPS:
-            north, east, _ = stopping_point(context.state)
-            self._wait_point = (north, east, self._down_m)
-        if self._wait_point is None:
-            velocity = (0.0, 0.0, correction(self._down_m - position[2]))
-        else:
-            velocity = self._controller.velocity(self._wait_point, context.state, dt_s)
-        if self._bearing_rad is None:
-            return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
-        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=self._bearing_rad)
+        return self._standing.setpoint(context.state, context.now_ns, dt_s, self._bearing_rad)
 
     def _look_again(self, why: str, lost_at: Vector3, context: BehaviourContext) -> BehaviourOutput:
         """Start another search where the object was; the outcome if the retries are used up."""
@@ -317,16 +303,15 @@ class ApproachBehaviour(Behaviour):
             return Outcome(False, why + (f"; searched again {times}" if self._tried else ""))
         self._tried += 1
         self.add_notes(f"approach: {why}; searching, {self._tried} of {self._retries}")
-        here, _ = position_and_yaw(context.state)
         context.objects.forget(self.subject)
-        self._search = search = _Search(why, lost_at, here, context.now_ns)
-        return self._look_back(search, context)
+        self._search = search = _Search(why, lost_at, context.now_ns)
+        return self._look_back(search, 0.0, context)
 
     def _look_for_it(self, search: _Search, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         if self._tracking is not None and (why := self._tracking.control_fault(context)) is not None:
             return Outcome(False, f"approach lost the gimbal: {why}")
         if search.seek is None:
-            return self._look_back(search, context)
+            return self._look_back(search, dt_s, context)
         step = search.seek.update(dt_s, context)
         if not isinstance(step, Outcome):
             return step
@@ -336,7 +321,7 @@ class ApproachBehaviour(Behaviour):
             return Outcome(False, f"{search.why}; {step.reason}")
         return self._look_again(search.why, search.lost_at, context)
 
-    def _look_back(self, search: _Search, context: BehaviourContext) -> BehaviourOutput:
+    def _look_back(self, search: _Search, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Hold with the nose towards the last known position; then turn."""
         now_ns = context.now_ns
         position, yaw_rad = position_and_yaw(context.state)
@@ -351,7 +336,8 @@ class ApproachBehaviour(Behaviour):
             search.seek = SeekBehaviour(turn, sweep=self._sweep())
             search.seek.on_activate(context)
             return search.seek.update(0.0, context)
-        return Setpoint.velocity(stay_at(search.hold_point, position), now_ns, yaw_rad=bearing_rad)
+        self._standing = self._standing or Standing()
+        return self._standing.setpoint(context.state, now_ns, dt_s, bearing_rad)
 
     def _sweep(self) -> GimbalSweep | None:
         """A sweep between the pitch at which the object was lost and level."""

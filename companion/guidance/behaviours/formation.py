@@ -30,7 +30,7 @@ from companion.guidance.formation.neighbours import Neighbour, Neighbourhood, an
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
 from companion.guidance.formation.separation import MARGIN_M, avoid, repulsion
 from companion.guidance.formation.virtual_structure import VirtualStructure
-from companion.guidance.motion import add_velocity_error, home_of, position_and_yaw, stopping_speed
+from companion.guidance.motion import Standing, add_velocity_error, home_of, position_and_yaw, stopping_speed
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
@@ -42,8 +42,6 @@ CLIMB_MPS = 1.0
 # Limits of the outermost slot's speed and acceleration in a turn.
 SWING_MPS = 1.5
 SWING_MPS2 = 0.7
-# Above this speed the vehicle brakes before it holds, else it would fly back.
-STANDING_MPS = 0.5
 # A neighbour slower than this relative to the formation is an obstacle to fly around.
 IN_THE_WAY_MPS = 0.6
 # Clearance of detours around others, added to the minimum separation.
@@ -132,7 +130,7 @@ class FormationBehaviour(Behaviour):
         self._turn_rate_radps = 0.0
         self._error_m = 0.0
         self._lost_since_ns: int | None = None
-        self._hold_point: Vector3 | None = None
+        self._standing: Standing | None = None
         self._arrived_since_ns: int | None = None
         self._over_since_ns: int | None = None
         self._led: bool | None = None
@@ -152,13 +150,14 @@ class FormationBehaviour(Behaviour):
         if hood is not None:
             hood = anchored(hood, context.state, context.now_ns)
         if hood is None or hood.problem is not None or hood.anchor is None:
-            return self._without_leader(context, "pose sharing is off" if hood is None else hood.problem)
+            why = "pose sharing is off" if hood is None else hood.problem
+            return self._without_leader(dt_s, context, why)
         leader = self._leader(dt_s, context, hood)
         if isinstance(leader, Outcome):
             return leader
         if isinstance(leader, str):
             self._report_waiting(hood)
-            return self._without_leader(context, leader)
+            return self._without_leader(dt_s, context, leader)
         self._lost_since_ns = None
         position, _ = position_and_yaw(context.state)
         if self._heading_rad is None:
@@ -171,8 +170,8 @@ class FormationBehaviour(Behaviour):
         self._publish(hood, agreement)
         if offset is None:
             self._words = f"waiting for a slot from {agreement.by}"
-            return self._stand(context)
-        self._hold_point = None
+            return self._stand(dt_s, context)
+        self._standing = None
         return self._fly(context, hood, leader, agreement, offset, position)
 
     # ---- the leader -------------------------------------------------------------------------------------
@@ -386,7 +385,7 @@ class FormationBehaviour(Behaviour):
         )
         return Setpoint.velocity((north, east, moving[2] + down), context.now_ns, yaw_rad=self._heading_rad)
 
-    def _without_leader(self, context: BehaviourContext, why: str | None) -> BehaviourOutput:
+    def _without_leader(self, dt_s: float, context: BehaviourContext, why: str | None) -> BehaviourOutput:
         """Brake and hold, at most for the time-out."""
         now_ns = context.now_ns
         if self._lost_since_ns is None:
@@ -395,19 +394,11 @@ class FormationBehaviour(Behaviour):
         if lost_s > (most_s := self._command.lost_timeout_s):
             return Outcome(False, f"{why or 'the leader is lost'}; waited for {most_s:g} s")
         self._words = f"holding: {why}"
-        return self._stand(context)
+        return self._stand(dt_s, context)
 
-    def _stand(self, context: BehaviourContext) -> Setpoint:
-        state, now_ns = context.state, context.now_ns
-        yaw_rad = self._heading_rad if self._heading_rad is not None else state.yaw_rad
-        if (
-            self._hold_point is None
-            and math.hypot(*(state.velocity_ned_mps or (0.0, 0.0, 0.0))) < STANDING_MPS
-        ):
-            self._hold_point = state.position_ned_m
-        if self._hold_point is None:
-            return Setpoint.velocity((0.0, 0.0, 0.0), now_ns, yaw_rad=yaw_rad)
-        return Setpoint.position(self._hold_point, now_ns, yaw_rad=yaw_rad)
+    def _stand(self, dt_s: float, context: BehaviourContext) -> Setpoint:
+        self._standing = self._standing or Standing()
+        return self._standing.setpoint(context.state, context.now_ns, dt_s, self._heading_rad)
 
     @property
     def status(self) -> str:

@@ -17,6 +17,7 @@ from companion.guidance.motion import (
     ARRIVED_M,
     Arrival,
     PositionController,
+    Standing,
     add_velocity_error,
     ground_speed,
     in_degrees,
@@ -73,6 +74,7 @@ class PathFlight(Behaviour):
         self._yaw_rad: float | None = None
         self._best_m = -math.inf
         self._best_ns = 0
+        self._standing: Standing | None = None
         self._arrival, self._controller = Arrival(), PositionController()
 
     @abstractmethod
@@ -86,19 +88,26 @@ class PathFlight(Behaviour):
     def on_activate(self, context: BehaviourContext) -> None:
         _, self._yaw_rad = position_and_yaw(context.state)
         self._follower, self._problem = None, ""
-        self._arrival, self._controller = Arrival(), PositionController()
-        self._best_m, self._best_ns = -math.inf, context.now_ns
+        self.resume(context)
         try:
             self._follower = PathFollower(self._path(context), self._laps)
         except ValueError as error:
             self._problem = str(error)
 
     def resume(self, context: BehaviourContext) -> None:
-        """Continue the path after an interruption."""
+        """The next `update` continues the path after an interruption."""
+        self._standing = None
         self._best_m, self._best_ns = -math.inf, context.now_ns
         self._arrival, self._controller = Arrival(), PositionController()
 
+    def stand(self, dt_s: float, context: BehaviourContext, yaw_rad: float | None = None) -> Setpoint:
+        """Instead of an update: brake and hold. `yaw_rad`: of the nose; None: it does not turn."""
+        self._standing = self._standing or Standing()
+        return self._standing.setpoint(context.state, context.now_ns, dt_s, yaw_rad)
+
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        if self._standing is not None:
+            self.resume(context)
         follower = self._follower
         if follower is None:
             return Outcome(False, f"{self.name}: {self._problem}")

@@ -11,7 +11,7 @@ from companion.geometry.points import points_from
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.follow_path import FollowPathBehaviour
-from companion.guidance.behaviours.seek import BlindTime, Facing, Standing, range_m, range_text
+from companion.guidance.behaviours.seek import BlindTime, Facing, range_m, range_text
 from companion.guidance.command import (
     BuildContext,
     ClassNames,
@@ -26,7 +26,6 @@ from companion.guidance.command import (
 from companion.guidance.motion import home_of, in_degrees
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
-from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 
 # A patrol ends after this time without a frame.
@@ -114,7 +113,6 @@ class PatrolBehaviour(Behaviour):
         self._facing: Facing | None = None
         self._approach: ApproachBehaviour | None = None
         self._wait_until_ns: float | None = None
-        self._standing: Standing | None = None
         self._blind = BlindTime(BLIND_TIMEOUT_S)
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
@@ -131,20 +129,17 @@ class PatrolBehaviour(Behaviour):
         if (blind := self._blind.outcome(context)) is not None:
             return blind
         if not context.perception_fresh:
-            return self._stand(context)  # so that no part of the path is flown unseen
+            return self._route.stand(dt_s, context)  # so that no part of the path is flown unseen
         self._known = [known for known in self._known if known.until_ns > context.now_ns]
         for known in self._known:
             known.object = context.objects.now(known.object)
         if self._facing is None:
             self._facing = self._find(context)
         if self._facing is not None:
-            return self._inspect(self._facing, context)
+            return self._inspect(self._facing, dt_s, context)
         return self._fly_on(dt_s, context)
 
     def _fly_on(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        if self._standing is not None:
-            self._standing = None
-            self._route.resume(context)
         step = self._route.update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             stops = f"{self._found} {'stop' if self._found == 1 else 'stops'}"
@@ -171,7 +166,7 @@ class PatrolBehaviour(Behaviour):
             return None
         return Facing(min(finds, key=lambda each: range_m(each, context)), context.now_ns)
 
-    def _inspect(self, facing: Facing, context: BehaviourContext) -> BehaviourOutput:
+    def _inspect(self, facing: Facing, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Stop, face the object and log it; then approach it, or dwell."""
         now_ns = context.now_ns
         facing.update(context)
@@ -190,7 +185,7 @@ class PatrolBehaviour(Behaviour):
             if self._approaches:
                 return self._go_there(facing.object, context)
             self._wait_until_ns = now_ns + self._command.dwell_s * 1e9
-        return self._stand(context, facing.bearing_rad)
+        return self._route.stand(dt_s, context, facing.bearing_rad)
 
     def _go_there(self, found: TrackedObject, context: BehaviourContext) -> BehaviourOutput:
         command, subject = self._command, Subject(found.class_name)
@@ -215,12 +210,9 @@ class PatrolBehaviour(Behaviour):
         approach.on_deactivate()
         self._approach = None
         self._note(step.reason)
-        self._standing, self._wait_until_ns = None, context.now_ns + self._command.dwell_s * 1e9
-        return self._stand(context)
-
-    def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
-        self._standing = self._standing or Standing(context)
-        return self._standing.setpoint(context, bearing_rad)
+        self._wait_until_ns = context.now_ns + self._command.dwell_s * 1e9
+        self._route.resume(context)
+        return self._route.stand(0.0, context)
 
     def _go_on(self, context: BehaviourContext) -> BehaviourOutput:
         self._facing = self._wait_until_ns = None

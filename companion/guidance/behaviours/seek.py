@@ -20,7 +20,7 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
-from companion.guidance.motion import ground_speed, in_degrees, laps_text, position_and_yaw, stay_at
+from companion.guidance.motion import Standing, in_degrees, laps_text, position_and_yaw
 from companion.guidance.objects.target import DOUBTED
 from companion.guidance.objects.tracked_object import FOUND_FRAMES, TrackedObject
 from companion.guidance.path import Path
@@ -43,8 +43,6 @@ SIGHT_LOST_S = 2.0
 SIGHT_FRESH_S = 0.7
 # Within this angle of nose and gimbal the camera sees the object.
 POINTED_RAD = math.radians(8.0)
-# Slower than this the vehicle counts as stopped, and holds.
-STANDING_MPS = 0.4
 BLIND_TIMEOUT_S = 5.0
 # Time-out of a turn relative to its nominal time, plus the time to face false finds.
 SLOWEST_TURN = 3.0
@@ -168,25 +166,6 @@ class Facing:
         )
 
 
-class Standing:
-    """Brakes, then holds where the vehicle comes to rest, at the height where it began."""
-
-    def __init__(self, context: BehaviourContext) -> None:
-        position, _ = position_and_yaw(context.state)
-        self._down_m = position[2]
-        self._point: Vector3 | None = None
-
-    def setpoint(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
-        """The next setpoint. `bearing_rad`: of the nose; None: unchanged."""
-        position, _ = position_and_yaw(context.state)
-        if self._point is None and ground_speed(context.state) < STANDING_MPS:
-            self._point = (position[0], position[1], self._down_m)
-        velocity = (0.0, 0.0, 0.0) if self._point is None else stay_at(self._point, position)
-        if bearing_rad is None:
-            return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=0.0)
-        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=bearing_rad)
-
-
 class BlindTime:
     """How long nothing was seen: a vehicle that stands meanwhile passes nothing unseen."""
 
@@ -234,10 +213,10 @@ class SeekBehaviour(Behaviour):
         self.class_names = (command.class_name,)
         self._turn = 1.0 if command.direction == "clockwise" else -1.0
         self._compare_at_rad = min(command.laps, 1.0) * math.tau if whole_turn else 0.0
-        self._begin(0, (0.0, 0.0, 0.0), 0.0)
+        self._begin(0, 0.0)
 
-    def _begin(self, now_ns: int, point: Vector3, yaw_rad: float) -> None:
-        self._begun_ns, self._point, self._yaw_rad = now_ns, point, yaw_rad
+    def _begin(self, now_ns: int, yaw_rad: float) -> None:
+        self._begun_ns, self._standing, self._yaw_rad = now_ns, Standing(), yaw_rad
         turn_s = self._command.laps * math.tau / self._rate_radps
         limit_s = SLOWEST_TURN * turn_s + MOST_FALSE_FINDS * FACING_TIMEOUT_S
         self._give_up_ns = now_ns + limit_s * 1e9
@@ -251,17 +230,17 @@ class SeekBehaviour(Behaviour):
         self._failure, self._return_until_ns = "", 0.0
 
     def on_activate(self, context: BehaviourContext) -> None:
-        self._begin(context.now_ns, *position_and_yaw(context.state))
+        self._begin(context.now_ns, position_and_yaw(context.state)[1])
         gimbal = context.state.gimbal
         if self._sweep is not None and gimbal is not None and gimbal.pitch_rad is not None:
             self._sweep.begin(gimbal.pitch_rad)  # else the first update reports what is missing
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns = context.now_ns
-        position, yaw_rad = position_and_yaw(context.state)
+        _, yaw_rad = position_and_yaw(context.state)
         self._turned_rad += self._turn * wrap_angle(yaw_rad - self._yaw_rad)
         self._yaw_rad = yaw_rad
-        stay = stay_at(self._point, position)
+        stay = self._standing.velocity(context.state, dt_s)
         wait = Setpoint.velocity(stay, now_ns, yaw_rate_radps=0.0)
 
         if self._sweep is not None and (why := self._hindered(self._sweep, context)) is not None:
@@ -278,7 +257,7 @@ class SeekBehaviour(Behaviour):
         if self._facing is None and (best := self._best(context)) is not None:
             self._facing = Facing(best, now_ns)
         if self._facing is not None:
-            return self._face(self._facing, dt_s, context) or wait
+            return self._face(self._facing, stay, dt_s, context) or wait
         if abs(self._turned_rad) >= self._command.laps * math.tau:
             why = f": {DOUBTED}" if self._doubted else ""
             self._failure = f"no {self._command.class_name} found in {laps_text(self._command.laps)}{why}"
@@ -317,7 +296,9 @@ class SeekBehaviour(Behaviour):
         best = [each for each in self._finds.values() if _rank(each) >= least]
         return min(best, key=lambda each: range_m(each, context))
 
-    def _face(self, facing: Facing, dt_s: float, context: BehaviourContext) -> BehaviourOutput | None:
+    def _face(
+        self, facing: Facing, stay: Vector3, dt_s: float, context: BehaviourContext
+    ) -> BehaviourOutput | None:
         """Turn nose and gimbal to the find; None: it is lost, and the next best or the turn follows."""
         pitch_off_rad = 0.0
         if self._sweep is not None:
@@ -332,7 +313,6 @@ class SeekBehaviour(Behaviour):
             return None
         if facing.faced:
             return Outcome(True, found_text(facing.object, context))
-        stay = stay_at(self._point, position_and_yaw(context.state)[0])
         return Setpoint.velocity(stay, context.now_ns, yaw_rad=facing.bearing_rad)
 
     @property
@@ -388,7 +368,6 @@ class SearchBehaviour(PathFlight):
     def _begin(self, now_ns: int) -> None:
         self._begun_ns, self._doubted = now_ns, False
         self._facing: Facing | None = None
-        self._standing: Standing | None = None
         self._blind = BlindTime(BLIND_TIMEOUT_S)
 
     def on_activate(self, context: BehaviourContext) -> None:
@@ -399,7 +378,7 @@ class SearchBehaviour(PathFlight):
         if (blind := self._blind.outcome(context)) is not None:
             return blind
         if not context.perception_fresh:
-            return self._stand(context)
+            return self.stand(dt_s, context)
         seen = context.objects.seen(self.class_names, self._command.confidence, self._begun_ns)
         self._doubted |= any(each.frames >= FOUND_FRAMES and not each.certain for each in seen)
         if self._facing is None and (found := [each for each in seen if each.certain]):
@@ -409,11 +388,8 @@ class SearchBehaviour(PathFlight):
             if self._facing.faced:
                 return Outcome(True, found_text(self._facing.object, context))
             if not self._facing.lost:
-                return self._stand(context, self._facing.bearing_rad)
+                return self.stand(dt_s, context, self._facing.bearing_rad)
             self._facing = None
-        if self._standing is not None:
-            self._standing = None
-            self.resume(context)
         step = super().update(dt_s, context)
         if isinstance(step, Outcome) and step.success:
             why = f": {DOUBTED}" if self._doubted else ""
@@ -425,10 +401,6 @@ class SearchBehaviour(PathFlight):
         if self._facing is not None:
             return f"facing the {self._command.class_name}"
         return f"searching an area for a {self._command.class_name}{super().status.removeprefix(self.name)}"
-
-    def _stand(self, context: BehaviourContext, bearing_rad: float | None = None) -> Setpoint:
-        self._standing = self._standing or Standing(context)
-        return self._standing.setpoint(context, bearing_rad)
 
     def _path(self, context: BehaviourContext) -> Path:
         position, _ = position_and_yaw(context.state)
