@@ -20,7 +20,7 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.gimbal.pitch import GimbalTracking, GimbalUse
-from companion.guidance.motion import add_velocity_error, correction, position_and_yaw
+from companion.guidance.motion import Standing, add_velocity_error, correction, position_and_yaw
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -110,6 +110,7 @@ class FollowBehaviour(Behaviour):
         self._object: TrackedObject | None = None
         self._started_ns = now_ns
         self._down_m = down_m
+        self._standing: Standing | None = None
         self._yaw_rad: float | None = None
         self._course_rad: float | None = None
         self._range_m = math.nan
@@ -145,16 +146,15 @@ class FollowBehaviour(Behaviour):
             why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"follow lost the gimbal: {why}")
-        height_mps = correction(self._down_m - position[2])
         if track is None or context.camera_fault:  # a prediction is for a hidden object, not for no camera
-            if self._yaw_rad is None:
-                return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rate_radps=0.0)
-            return Setpoint.velocity((0.0, 0.0, height_mps), now_ns, yaw_rad=self._yaw_rad)
-
+            self._standing = self._standing or Standing()
+            return self._standing.setpoint(state, now_ns, dt_s, self._yaw_rad)
+        self._standing = None
         self._yaw_rad = towards_rad = math.atan2(east, north)
         wanted = self._wanted(track, towards_rad, dt_s)
         north_mps, east_mps = add_velocity_error(wanted, state, self._command.speed_mps, VELOCITY_ERROR_GAIN)
-        return Setpoint.velocity((north_mps, east_mps, height_mps), now_ns, yaw_rad=towards_rad)
+        down_mps = correction(self._down_m - position[2])
+        return Setpoint.velocity((north_mps, east_mps, down_mps), now_ns, yaw_rad=towards_rad)
 
     def _wanted(self, track: TrackedObject, towards_rad: float, dt_s: float) -> tuple[float, float]:
         """Horizontal velocity: the object's own, plus corrections along and across the line to it.

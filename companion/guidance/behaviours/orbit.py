@@ -22,6 +22,7 @@ from companion.guidance.command import (
 )
 from companion.guidance.motion import (
     STOPPING_MPS2,
+    Standing,
     correction,
     in_degrees,
     laps_text,
@@ -118,6 +119,7 @@ class OrbitBehaviour(Behaviour):
 
     def _begin(self, down_m: float) -> None:
         self._centre: Vector3 | None = None
+        self._standing = Standing()
         self._drift_mps = (0.0, 0.0)
         self._down_m = down_m
         self._angle_rad: float | None = None
@@ -164,9 +166,7 @@ class OrbitBehaviour(Behaviour):
         if (why := self._observe(context)) is not None:
             return Outcome(False, why)
         if self._centre is None:
-            return Setpoint.velocity(
-                (0.0, 0.0, correction(self._down_m - position[2])), context.now_ns, yaw_rate_radps=0.0
-            )
+            return self._standing.setpoint(context.state, context.now_ns, dt_s, None)
         if self._until_ns == math.inf:
             self._begin_circle(self._centre, position, context)
         north, east = position[0] - self._centre[0], position[1] - self._centre[1]

@@ -21,9 +21,11 @@ from companion.bench.synthetic_detector import SceneObject, ScenePose, Synthetic
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour
+from companion.guidance.behaviours.follow import Follow, FollowBehaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
+from companion.guidance.behaviours.seek import Seek, SeekBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.guidance.objects.tracked_object import Subject
@@ -41,6 +43,7 @@ VEHICLES: dict[str, dict[str, float]] = {
 SEEDS = {"px4": (1, 2, 3), "slow": (4,), "loose": (5, 6)}
 GUSTS_MPS = 0.6
 HOLD_S = 10.0
+CAR = Subject("car")
 
 
 # Every vehicle with all of its seeds; `make test` flies the first.
@@ -133,6 +136,34 @@ def test_hold_stays_within_0_3_m_in_gusts(seed: int) -> None:
     outcome, hold = then_hold(LockstepFlight.airborne(**air("px4", seed)), goto)
     assert outcome.goal_ned_m is not None
     assert max(math.dist(m.context.state.position_ned_m or (), outcome.goal_ned_m) for m in hold) <= 0.3
+
+
+@pytest.mark.parametrize(
+    "behaviour",
+    [
+        ApproachBehaviour(Approach(CAR, lost_timeout_s=60.0)),
+        FollowBehaviour(Follow(CAR, occlusion_s=60.0)),
+        SeekBehaviour(Seek("car", laps=20.0)),
+    ],
+    ids=lambda behaviour: behaviour.name,
+)
+def test_what_waits_for_an_object_stays_in_gusts(behaviour: Behaviour) -> None:
+    camera = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
+    far = SceneObject("person", (0.5, 0.6, 1.7), lambda _: ScenePose(900.0, 0.0, 0.0))
+    nothing = SyntheticDetector([far], camera, CameraMount(), seed=1)
+    settings = camera_settings(camera, CameraMount())
+    flight = LockstepFlight.airborne(
+        seed=1,
+        wind_mps=3.0,
+        gusts_mps=GUSTS_MPS,
+        noise=0.0,
+        camera=lambda _: SyntheticCamera(settings, detect=nothing),
+    )
+    flight.run(1.0)
+    moments = [moment for moment in flight.fly(behaviour, 15.0).moments if moment.seconds > 1.0]
+    places = [known(moment.context.state.position_ned_m) for moment in moments]
+    assert len(places) > 200
+    assert max(math.dist(place, places[0]) for place in places) <= 0.4
 
 
 @pytest.mark.parametrize(("name", "seed"), FLIGHTS)
