@@ -309,7 +309,7 @@ class Fleet:
             for member in members:
                 self._deliver(member)
                 member.flight.tick()
-                member.limited.update(member.flight.guidance.limited_by)
+                member.limited.update(member.flight.guidance.setpoints.limited_by)
         for one, other in itertools.combinations(members, 2):
             self.least_m = min(self.least_m, math.dist(one.airframe.place(), other.airframe.place()))
 

@@ -379,17 +379,17 @@ class LockstepFlight:
                 camera.on_state(state, self.inputs.history)
 
     def _moment(self) -> Moment | None:
-        guidance = self.guidance
-        active = guidance.phase is Phase.OFFBOARD and guidance.sent is not None and guidance.busy
-        if not active or guidance.asked is None or guidance.sent is None or guidance.context is None:
+        guidance, setpoints = self.guidance, self.guidance.setpoints
+        active = guidance.phase is Phase.OFFBOARD and guidance.busy
+        if not active or setpoints.asked is None or setpoints.sent is None or guidance.context is None:
             return None
         return Moment(
             self.seconds,
             self.vehicle.truth,
             guidance.context,
-            guidance.asked,
-            guidance.sent,
-            guidance.limited_by,
+            setpoints.asked,
+            setpoints.sent,
+            setpoints.limited_by,
         )
 
     def _judge(self, moment: Moment, log: FlightLog) -> None:

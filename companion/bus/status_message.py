@@ -57,7 +57,7 @@ def status_message(
         now_ns: CLOCK_MONOTONIC. steering: the camera that guidance uses. others: services that command the
             same vehicle. parameters: read from the autopilot. dropped_lines: of the log.
     """
-    state, limits, received = driver.state, guidance.limits, driver.reception
+    state, limits, received = driver.state, guidance.setpoints.limits, driver.reception
     seeing = not steering.overdue(now_ns)
     has_vehicle = any(part["name"] == "autopilot" for part in parts)
     silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
@@ -138,7 +138,7 @@ def status_message(
 
 
 def _command(guidance: Guidance, service: str) -> StatusCommandBody | None:
-    command = guidance.command
+    command = guidance.runner.command
     if command is None:
         return None
     return {"id": command_id(service, command.identifier), "command": command.text}

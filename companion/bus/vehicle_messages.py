@@ -69,12 +69,12 @@ def setpoints_message(guidance: Guidance, streamer: Streamer, now_ns: int) -> Se
     """Create the message of the requested setpoint and the one sent."""
     return {
         "stamp_ns": now_ns,
-        "asked": setpoint_message(guidance.asked),
+        "asked": setpoint_message(guidance.setpoints.asked),
         "sent": setpoint_message(streamer.last_sent),
         "sent_ns": streamer.last_sent_ns,
         "stream": streamer.state.value,
-        "limited_by": list(guidance.limited_by),
-        "path_ned_m": [[round(north, 2), round(east, 2)] for north, east in guidance.path],
+        "limited_by": list(guidance.setpoints.limited_by),
+        "path_ned_m": [[round(north, 2), round(east, 2)] for north, east in guidance.setpoints.path],
     }
 
 

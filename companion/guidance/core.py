@@ -38,9 +38,8 @@ from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.landing_target import LandingTarget
-from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
+from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
 from vision.obstacle_sectors import ObstacleSectors
-from vision.occupancy_grid import Point
 
 logger = logging.getLogger(__name__)
 
@@ -71,28 +70,30 @@ class GuidanceOptions:
 
 
 class Guidance:
-    """One vehicle's guidance. Its options are fixed at construction.
+    """One vehicle's guidance.
 
     Attributes:
-        gimbal: the gimbal controller; for its status.
+        options: the operator's settings, fixed at construction.
+        gimbal, setpoints, runner: its parts; for their status.
+        context: the input of behaviours at the newest step; None before the first.
     """
 
     def __init__(self, options: GuidanceOptions | None = None) -> None:
-        self._options = options = options or GuidanceOptions()
+        self.options = options = options or GuidanceOptions()
         self.gimbal = GimbalController(options.gimbal)
         self._out = OutputCollector()
-        self._setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
-        self._modes = ModeControl(self._setpoints, self._out)
+        self.setpoints = SetpointOutput(options.limits, options.obstacles, options.lifetime_s, self._out)
+        self._modes = ModeControl(self.setpoints, self._out)
         self._objects: tuple[TrackedObject, ...] = ()
         self._marker_objects: tuple[TrackedObject, ...] = ()
         self._choices: dict[Subject, Choice] = {}
         self._has_gimbal = False
         self._queue = CommandQueue(self.gimbal)
-        self._runner = BehaviourRunner(self._setpoints, self._modes, options.battery, self._queue, self._out)
+        self.runner = BehaviourRunner(self.setpoints, self._modes, options.battery, self._queue, self._out)
         # Of the steering camera, and of those that look down.
         self._closing, self._closing_below = ClosingCheck(), ClosingCheck()
         self._approaching: tuple[Behaviour | None, int] = None, 0
-        self._context: BehaviourContext | None = None
+        self.context: BehaviourContext | None = None
         self._class_names: tuple[str, ...] | None = None
         self._mode_changes = 0
         self._landing_target_ns = self._obstacle_distance_ns = 0
@@ -100,49 +101,9 @@ class Guidance:
         self._refuse_until_ns = 0
 
     @property
-    def options(self) -> GuidanceOptions:
-        """The operator's settings."""
-        return self._options
-
-    @property
-    def limits(self) -> Limits:
-        """The limits of setpoints: the operator's, within the autopilot's."""
-        return self._setpoints.limits
-
-    @property
-    def active(self) -> Behaviour | None:
-        """The active behaviour, inside a sequence its current one; None: none has been updated yet."""
-        return self._runner.active
-
-    @property
     def behaviour(self) -> Behaviour | None:
         """The active behaviour, including the hold between commands; None: none."""
-        return self._runner.behaviour
-
-    @property
-    def asked(self) -> Setpoint | None:
-        """The last setpoint of a behaviour; None: none is active."""
-        return self._setpoints.asked
-
-    @property
-    def sent(self) -> Setpoint | None:
-        """The last setpoint after the envelope, or the brake that is streamed while a mode is requested."""
-        return self._setpoints.sent
-
-    @property
-    def limited_by(self) -> tuple[str, ...]:
-        """Names of the limits that changed `sent`."""
-        return self._setpoints.limited_by
-
-    @property
-    def path(self) -> tuple[Point, ...]:
-        """(north, east) points of the active path around obstacles; empty: none."""
-        return self._setpoints.path
-
-    @property
-    def command(self) -> CommandInput | None:
-        """The command that has begun and not ended; None: none has."""
-        return self._runner.command
+        return self.runner.behaviour
 
     @property
     def phase(self) -> Phase:
@@ -150,14 +111,9 @@ class Guidance:
         return self._modes.phase
 
     @property
-    def context(self) -> BehaviourContext | None:
-        """The input of behaviours at the newest step; None before the first."""
-        return self._context
-
-    @property
     def busy(self) -> bool:
         """A commanded behaviour has not ended yet."""
-        return self._runner.busy
+        return self.runner.busy
 
     @property
     def in_command(self) -> bool:
@@ -193,19 +149,19 @@ class Guidance:
         out = self._out
         out.now_ns = now_ns
         out.requests, out.cancelled, out.events, out.results, out.endings = [], [], [], [], []
-        self._setpoints.use_autopilot(inputs.parameters)
+        self.setpoints.use_autopilot(inputs.parameters)
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)
         if inputs.mode_changes != self._mode_changes and self.phase is Phase.IDLE:
-            self._runner.goal_ned_m = None  # flown by someone else since
+            self.runner.goal_ned_m = None  # flown by someone else since
         self._mode_changes = inputs.mode_changes
-        before, context = self._context, self._observe(now_ns, inputs)
-        self._context, self._class_names = context, inputs.class_names
+        before, context = self.context, self._observe(now_ns, inputs)
+        self.context, self._class_names = context, inputs.class_names
         if inputs.ending:
             self._queue.close(out)
             for command in inputs.commands:
                 out.ended(command.identifier, Outcome(False, ENDING))
-            self._runner.end(Outcome(False, ENDING))
+            self.runner.end(Outcome(False, ENDING))
             self._modes.release()
             self.gimbal.end(now_ns, inputs.state, out)
             return self._output(None, released=self.gimbal.released)
@@ -217,26 +173,26 @@ class Guidance:
             if (why := self._outdated(command, inputs.standstill, now_ns)) is not None:
                 out.ended(command.identifier, Outcome(False, why))
                 continue
-            self._queue.add(command, context, self._runner.gimbal_user, out)
+            self._queue.add(command, context, self.runner.gimbal_user, out)
         if self._queue.due or self._queue.waiting:
             for command in self._queue.take_due(context, out):
                 self._begin_command(command, context)
         landing_target = None
         try:
-            self._runner.update(context, before, inputs)
+            self.runner.update(context, before, inputs)
             landing_target = self._new_landing_target()
             if self._has_gimbal:
-                self.gimbal.update(context, self._runner.active, out)
+                self.gimbal.update(context, self.runner.active, out)
         except Exception as error:
-            self._runner.handle_error(error, context, inputs.stream.sent_count)
+            self.runner.handle_error(error, context, inputs.stream.sent_count)
         else:
-            self._runner.failure = ""  # this step raised nothing
-        self._runner.answer_endless(inputs)
+            self.runner.failure = ""  # this step raised nothing
+        self.runner.answer_endless(inputs)
         return self._output(landing_target)
 
     def check_requirements(self, behaviour: Behaviour) -> str | None:
         """Why this behaviour could not begin now, in words; None: it could."""
-        options, context = self.options, self._context
+        options, context = self.options, self.context
         missing = check_requirements(
             behaviour, context, self._class_names, options.battery, options.obstacles
         )
@@ -246,14 +202,14 @@ class Guidance:
         _, _, down = context.state.position_ned_m or home
         elsewhere = replace(context, state=replace(context.state, position_ned_m=(math.nan, math.nan, down)))
         for each, begun in ((behaviour, context), *((later, elsewhere) for later in behaviour.later)):
-            if (why := self._setpoints.check_goals(each.goals(begun), context.state)) is not None:
+            if (why := self.setpoints.check_goals(each.goals(begun), context.state)) is not None:
                 return f"{each.name} would leave the limits: {why}"
         return None
 
     def _end_after(self, standstill: Standstill, now_ns: int) -> None:
         """The computer or the process stood still: whatever was commanded before ends, also what waits."""
         self._queue.supersede(f"an event ({standstill.why})", self._out)
-        self._runner.end_after_standstill(standstill.why)
+        self.runner.end_after_standstill(standstill.why)
         self._objects = self._marker_objects = ()
         if standstill.long or standstill.suspended:
             self._standstill = standstill
@@ -294,12 +250,12 @@ class Guidance:
             age_s,
             fresh,
             inputs.obstacles,
-            self.sent,
+            self.setpoints.sent,
             markers=inputs.markers,
             neighbourhood=inputs.neighbourhood,
             min_separation_m=self.options.limits.min_separation_m,
             max_acceleration_mps2=self.options.limits.max_acceleration_mps2,
-            goal_ned_m=self._runner.goal_ned_m,
+            goal_ned_m=self.runner.goal_ned_m,
             gimbal=gimbal,
             ranging=inputs.ranging,
             steering_markers=inputs.steering_markers,
@@ -324,15 +280,15 @@ class Guidance:
             context.state.position_ned_m,
             "" if context.perception_fresh else fault,
             "" if context.steering_markers.fresh else fault,
-            self._options.track_max_age_s,
+            self.options.track_max_age_s,
             self._choices,
         )
         return replace(context, objects=in_view)
 
     def _without_wrong_cameras(self, context: BehaviourContext) -> BehaviourContext:
         """The context without what a camera shows that does not fit the vehicle's motion (`ClosingCheck`)."""
-        active, position = self._runner.active, context.state.position_ned_m
-        if not self._runner.busy:
+        active, position = self.runner.active, context.state.position_ned_m
+        if not self.runner.busy:
             self._closing.reset()
             self._closing_below.reset()
         resets = context.state.reset_count
@@ -342,14 +298,14 @@ class Guidance:
             self._closing.begin_again()
             self._closing_below.begin_again()
         if position is not None:
-            needs, stamp_ns = self._runner.needs, context.state.position_ns
+            needs, stamp_ns = self.runner.needs, context.state.position_ns
             below = Requirement.MARKER in needs
-            ahead, beneath = (None, self._runner.approached) if below else (self._runner.approached, None)
+            ahead, beneath = (None, self.runner.approached) if below else (self.runner.approached, None)
             known = self._closing.fault, self._closing_below.fault
             self._closing.update(ahead, context.targets, stamp_ns, position, used=bool(needs & _STEERED))
             self._closing_below.update(beneath, (), stamp_ns, position)
             for before, fault in zip(known, (self._closing.fault, self._closing_below.fault), strict=True):
-                if fault and not before and (behaviour := self._runner.behaviour) is not None:
+                if fault and not before and (behaviour := self.runner.behaviour) is not None:
                     self._out.event(EventKind.NOTED, behaviour.name, fault, warning=True)
         if self._closing.fault:
             context = _blinded(context, self._closing.fault)
@@ -361,12 +317,12 @@ class Guidance:
     def _output(self, landing_target: LandingTarget | None, *, released: bool = False) -> GuidanceOutput:
         out = self._out
         return GuidanceOutput(
-            self.sent if self._setpoints.streaming else None,
+            self.setpoints.sent if self.setpoints.streaming else None,
             tuple(out.requests),
             tuple(out.cancelled),
             landing_target,
             self._due_obstacles(),
-            self._setpoints.take_path_request() if self._options.avoid else None,
+            self.setpoints.take_path_request() if self.options.avoid else None,
             tuple(out.events),
             tuple(out.results),
             released,
@@ -380,7 +336,7 @@ class Guidance:
         try:
             missing = self.check_requirements(behaviour)
             # One that has just begun is not known as active yet.
-            active = self._runner.active or self._runner.behaviour
+            active = self.runner.active or self.runner.behaviour
             if missing is None and active is not None:
                 missing = behaviour.blocked_by(active, context)
         except Exception as error:
@@ -394,13 +350,13 @@ class Guidance:
         self._closing.reset()
         self._closing_below.reset()
         self._choices.clear()
-        self._runner.begin_command(behaviour, command, context)
+        self.runner.begin_command(behaviour, command, context)
         if isinstance(behaviour, StopBehaviour):
             self.gimbal.end_goal(behaviour.name, self._out)
 
     def _new_landing_target(self) -> LandingTarget | None:
         """The target of the autopilot's precision landing, once per frame that shows it."""
-        target = None if self._runner.behaviour is None else self._runner.behaviour.landing_target
+        target = None if self.runner.behaviour is None else self.runner.behaviour.landing_target
         if target is None or target.captured_ns <= self._landing_target_ns:
             return None
         self._landing_target_ns = target.captured_ns
@@ -408,7 +364,7 @@ class Guidance:
 
     def _due_obstacles(self) -> ObstacleSectors | None:
         """The sectors for the autopilot, also while a pilot flies; None: not due, or stale."""
-        context = self._context
+        context = self.context
         if not self.options.send_obstacle_distance or context is None:
             return None
         if context.now_ns < self._obstacle_distance_ns or not self.options.obstacles.fresh(context):

@@ -221,9 +221,9 @@ class Publisher:
                 return
 
     def _publish_vehicle(self, guidance: Guidance, streamer: Streamer, now_ns: int) -> None:
-        bus, state = self._bus, self._driver.state
+        bus, state, poses = self._bus, self._driver.state, self._inputs.poses
         bus.publish(topics.VEHICLE, lambda: vehicle_message(state, now_ns))
-        note, poses = None if guidance.active is None else guidance.active.note, self._inputs.poses
+        note = None if (active := guidance.runner.active) is None else active.note
         # By the clock that counts a suspend: until guidance's next step the state may be from before it.
         pose = poses.pose(state, note, self._driver.watch.now_ns(), in_command=guidance.in_command)
         if pose is not None:

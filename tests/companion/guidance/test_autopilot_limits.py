@@ -46,7 +46,7 @@ def test_vehicle_slower_than_commanded_is_no_other_commander(fastest_mps: float)
     flight = LockstepFlight.airborne(seed=5, settings=settings, parameters={"MPC_XY_VEL_MAX": fastest_mps})
     log = flight.fly("goto north=30 east=0 speed=4", 90.0)
     assert_succeeded(log.outcome)
-    assert flight.guidance.limits.max_horizontal_speed_mps == fastest_mps
+    assert flight.guidance.setpoints.limits.max_horizontal_speed_mps == fastest_mps
     for moment in log.moments:
         north, east, _ = moment.sent.velocity_ned_mps or (0.0, 0.0, 0.0)
         assert math.hypot(north, east) <= fastest_mps + 1e-9

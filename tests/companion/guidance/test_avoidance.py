@@ -72,7 +72,7 @@ def test_goto_flies_the_planned_path() -> None:
     assert max(east for _, east, _ in track) > 2.0
     assert track[-1][:2] == pytest.approx((12.0, 0.0), abs=0.3)
     assert next(iter(harness.results.values())).success
-    assert harness.guidance.path == ()  # arrived
+    assert harness.guidance.setpoints.path == ()  # arrived
     request = harness.path_requests[0]
     assert request.clearance_m == pytest.approx(1.2)
     assert request.reference[-1] == pytest.approx((12.0, 0.0), abs=0.1)
@@ -88,12 +88,12 @@ def test_patrol_flies_the_planned_path() -> None:
 def test_flown_path_is_shown_while_it_is_flown() -> None:
     harness = harness_with(around(3.0))
     north, east, _ = flown(harness, 2.0)[-1]
-    (first, *further) = harness.guidance.path
+    (first, *further) = harness.guidance.setpoints.path
     assert first == pytest.approx((north, east), abs=0.2)
     assert further == [(5.0, 3.0), (12.0, 0.0)]
     harness.command(HoldBehaviour())
     harness.run(0.1)
-    assert harness.guidance.path == ()
+    assert harness.guidance.setpoints.path == ()
 
 
 def test_no_path_is_requested_without_avoid_or_by_hold() -> None:
@@ -148,8 +148,8 @@ def test_gust_to_an_obstacle_is_countered_without_turning_away() -> None:
     flown(harness, 0.5)
     harness.vehicle.velocity[0] = 0.6
     harness.run()
-    assert harness.guidance.asked is not None
-    assert harness.guidance.asked.velocity_ned_mps == pytest.approx((-2.1, 0.0, 0.0), abs=0.3)
+    assert harness.guidance.setpoints.asked is not None
+    assert harness.guidance.setpoints.asked.velocity_ned_mps == pytest.approx((-2.1, 0.0, 0.0), abs=0.3)
     harness.run(3.0)
     assert harness.vehicle.position[0] < -0.8
     assert harness.vehicle.yaw_rad == pytest.approx(0.0, abs=0.05)

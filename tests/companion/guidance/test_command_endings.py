@@ -212,7 +212,7 @@ def check_ended(flight: Flight, identifier: str, *words: str, success: bool = Fa
     assert [word for word in words if word not in last["reason"]] == [], last["reason"]
     assert all(state["success"] is None for state in states[:-1])
     assert states == sorted(states, key=lambda state: state["stamp_ns"])
-    command = flight.harness.guidance.command
+    command = flight.harness.guidance.runner.command
     assert command is None or identifier != f"s-{command.identifier}"
 
 

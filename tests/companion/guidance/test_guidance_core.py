@@ -308,11 +308,11 @@ def test_sent_setpoint_is_passed_to_the_behaviour() -> None:
     behaviour = Curious()
     engaged(harness, behaviour)
     harness.run(5.0)
-    assert harness.guidance.asked is not None
-    assert harness.guidance.asked.velocity_ned_mps == pytest.approx((9.0, 0.0, 0.0), abs=1e-3)
-    assert harness.guidance.sent is not None
-    assert harness.guidance.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
-    assert harness.guidance.limited_by
+    assert harness.guidance.setpoints.asked is not None
+    assert harness.guidance.setpoints.asked.velocity_ned_mps == pytest.approx((9.0, 0.0, 0.0), abs=1e-3)
+    assert harness.guidance.setpoints.sent is not None
+    assert harness.guidance.setpoints.sent.velocity_ned_mps == pytest.approx((5.0, 0.0, 0.0))
+    assert harness.guidance.setpoints.limited_by
     dt_s, sent = behaviour.seen[-1]
     assert dt_s == pytest.approx(STEP_S)
     assert sent is not None

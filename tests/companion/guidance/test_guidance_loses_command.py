@@ -42,7 +42,7 @@ def test_foreign_mode_ends_command_permanently(mode: FlightMode, lag_s: float) -
     harness.run(3.0)
     assert len(harness.autopilot.setpoints) == sent
     assert not harness.guidance.in_command
-    assert harness.guidance.sent is None
+    assert harness.guidance.setpoints.sent is None
     # Only an operator's command resumes.
     harness.autopilot.change_mode(FlightMode.POSITION)
     harness.run(1.2)

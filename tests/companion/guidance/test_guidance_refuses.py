@@ -105,8 +105,8 @@ def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
     harness.run(0.5)
     assert not future.done()
     assert harness.guidance.phase == "offboard"
-    assert harness.guidance.asked is not None
-    assert harness.guidance.asked.yaw_rate_radps in (None, 0.0)
+    assert harness.guidance.setpoints.asked is not None
+    assert harness.guidance.setpoints.asked.yaw_rate_radps in (None, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -305,8 +305,8 @@ def test_approach_arrives_among_wrong_boxes(seed: int) -> None:
 
     def ended() -> bool:
         check(seen.perceived.objects.objects)
-        assert flight.guidance.sent is None or all(
-            map(math.isfinite, flight.guidance.sent.velocity_ned_mps or (0.0,))
+        assert flight.guidance.setpoints.sent is None or all(
+            map(math.isfinite, flight.guidance.setpoints.sent.velocity_ned_mps or (0.0,))
         )
         return flight.outcome(identifier) is not None
 

@@ -51,7 +51,7 @@ def context(
 
 
 def sent_velocity(harness: GuidanceHarness) -> Vector3:
-    sent = known(harness.guidance.sent)
+    sent = known(harness.guidance.setpoints.sent)
     assert sent.velocity_ned_mps is not None
     return sent.velocity_ned_mps
 
@@ -184,7 +184,7 @@ def test_brake_is_sent_while_depth_is_missing() -> None:
     seen = False
     harness.run(0.1)
     assert sent_velocity(harness) == (0.0, 0.0, 0.0)
-    assert [reason[:8] for reason in harness.guidance.limited_by] == ["no depth"]
+    assert [reason[:8] for reason in harness.guidance.setpoints.limited_by] == ["no depth"]
     seen = True
     harness.run(1.0)
     assert math.hypot(*sent_velocity(harness)) > 0.5

@@ -122,7 +122,8 @@ def _mission(*steps: str, at: str) -> Callable[[], GuidanceHarness]:
         text = "".join(f'[[step]]\ndo = "{step}"\non_failure = "continue"\n' for step in steps)
         plan = plan_from(text, "test.toml")
         harness.command(SequenceBehaviour(plan, harness.guidance.check_requirements))
-        harness.until(lambda: harness.guidance.active is not None and harness.guidance.active.name == at)
+        runner = harness.guidance.runner
+        harness.until(lambda: runner.active is not None and runner.active.name == at)
         harness.run(0.3)
         return harness
 
