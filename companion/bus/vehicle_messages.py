@@ -13,10 +13,11 @@ from companion.bus.bodies.vehicle import (
     StructureBody,
     VehicleBody,
 )
-from companion.geometry.geodesy import GeodeticOrigin, latitude_longitude
+from companion.geometry.geodesy import GeodeticOrigin
 from companion.guidance.core import Guidance
-from companion.guidance.formation.pose import FormationNote, Pose, Structure, global_problem
+from companion.guidance.formation.pose import FormationNote, Pose, Structure
 from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.global_position import Anchor
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import VehicleState
 from companion.vehicle.streamer import Streamer
@@ -94,14 +95,8 @@ def setpoint_message(setpoint: Setpoint | None) -> SetpointBody | None:
 
 def geodetic_origin(state: VehicleState, now_ns: int) -> GeodeticOrigin | None:
     """Return latitude, longitude and height of the origin of local NED; None while they are unknown."""
-    position, velocity = state.position_ned_m, state.velocity_ned_mps
-    if global_problem(state, now_ns) is not None or position is None or velocity is None:
-        return None
-    # The two positions have different stamps.
-    later_s = (state.global_ns - state.position_ns) / 1e9
-    north, east, down = (p + v * later_s for p, v in zip(position, velocity, strict=True))
-    latitude, longitude = latitude_longitude((state.latitude_deg, state.longitude_deg), -north, -east)
-    return GeodeticOrigin(latitude, longitude, state.altitude_amsl_m + down)
+    anchor = Anchor.of(state, now_ns)
+    return None if anchor is None else GeodeticOrigin(*anchor.globally((0.0, 0.0, 0.0)))
 
 
 def pose_message(pose: Pose) -> PoseBody:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from companion.geometry.geodesy import north_east
+from companion.vehicle.global_position import Anchor, global_problem
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import LandedState, Vector3, VehicleState, with_fields
 
-# GLOBAL_POSITION_INT comes 5 to 50 times a second.
-GLOBAL_MAX_AGE_S = 0.5
 # Gain from position error to velocity, 1/s: about PX4's own MPC_XY_P and MPC_Z_P.
 POSITION_GAIN = 0.9
 # Above this speed a vehicle that is to stand brakes before it holds its position, else it would fly back.
@@ -67,14 +65,10 @@ def local_from_global(
     state: VehicleState, now_ns: int, latitude_longitude_deg: tuple[float, float]
 ) -> tuple[float, float]:
     """North and east of a place (WGS 84) in local NED. Raises ValueError where the vehicle's is unknown."""
-    position, _ = position_and_yaw(state)
-    if not (math.isfinite(state.latitude_deg) and math.isfinite(state.longitude_deg)):
-        raise ValueError("latitude and longitude not received")
-    age_s = (now_ns - state.global_ns) / 1e9
-    if age_s > GLOBAL_MAX_AGE_S:
-        raise ValueError(f"latitude and longitude stale ({age_s:.1f} s)")
-    north, east = north_east((state.latitude_deg, state.longitude_deg), latitude_longitude_deg)
-    return (position[0] + north, position[1] + east)
+    anchor = Anchor.of(state, now_ns)
+    if anchor is None:
+        raise ValueError(global_problem(state, now_ns))
+    return anchor.local(*latitude_longitude_deg, anchor.altitude_m)[:2]
 
 
 def ground_speed(state: VehicleState) -> float:

@@ -11,10 +11,10 @@ import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from companion.geometry.geodesy import latitude_longitude, north_east
-from companion.guidance.formation.pose import FormationNote, Pose, global_problem, pose_from_message, pose_of
+from companion.guidance.formation.pose import FormationNote, Pose, pose_from_message, pose_of
 from companion.peer_data import parse_object
 from companion.vehicle.clock_sync import SenderDelay
+from companion.vehicle.global_position import Anchor, global_problem
 from companion.vehicle.state import Vector3, VehicleState
 from vision.attitude import wrap_angle
 
@@ -81,7 +81,7 @@ def anchored(neighbourhood: Neighbourhood, state: VehicleState, now_ns: int) -> 
     if neighbourhood.vehicles or neighbourhood.anchor is not None or neighbourhood.problem is not None:
         return neighbourhood
     anchor = Anchor.of(state, now_ns)
-    problem = None if anchor else global_problem(state, now_ns) or "own position unknown"
+    problem = None if anchor else global_problem(state, now_ns)
     return replace(neighbourhood, anchor=anchor, problem=problem)
 
 
@@ -106,43 +106,6 @@ def missing_neighbours(
         elif vehicle.silent:
             missing.append(f"the pose of {name} (stale: {vehicle.age_s:.1f} s)")
     return missing
-
-
-@dataclass(frozen=True, slots=True)
-class Anchor:
-    """One point known both globally and in the own local frame."""
-
-    latitude_deg: float
-    longitude_deg: float
-    altitude_m: float
-    position_ned_m: Vector3
-
-    @classmethod
-    def of(cls, state: VehicleState, now_ns: int) -> Anchor | None:
-        """The vehicle's newest position in both frames; None while either is unknown."""
-        position, velocity = state.position_ned_m, state.velocity_ned_mps
-        if global_problem(state, now_ns) is not None or position is None or velocity is None:
-            return None
-        # They come in separate messages: the local position is predicted to the global one's time.
-        dt_s = (state.global_ns - state.position_ns) / 1e9
-        north, east, down = (p + v * dt_s for p, v in zip(position, velocity, strict=True))
-        return cls(state.latitude_deg, state.longitude_deg, state.altitude_amsl_m, (north, east, down))
-
-    def local(self, latitude_deg: float, longitude_deg: float, altitude_m: float) -> Vector3:
-        """A global position in the local frame, NED metres."""
-        north, east = north_east((self.latitude_deg, self.longitude_deg), (latitude_deg, longitude_deg))
-        return (
-            self.position_ned_m[0] + north,
-            self.position_ned_m[1] + east,
-            self.position_ned_m[2] - (altitude_m - self.altitude_m),
-        )
-
-    def globally(self, position: Vector3) -> Vector3:
-        """A local position as latitude, longitude (degrees) and height above sea level (metres)."""
-        north, east = position[0] - self.position_ned_m[0], position[1] - self.position_ned_m[1]
-        here = (self.latitude_deg, self.longitude_deg)
-        altitude_m = self.altitude_m - (position[2] - self.position_ned_m[2])
-        return (*latitude_longitude(here, north, east), altitude_m)
 
 
 @dataclass(slots=True)

@@ -14,11 +14,9 @@ from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from companion.geometry.formation import SHAPES
 from companion.peer_data import PeerDataError
+from companion.vehicle.global_position import global_problem
 from companion.vehicle.state import LandedState, VehicleState
 from vision.attitude import euler_from_quaternion
-
-# GLOBAL_POSITION_INT comes 5 to 50 times a second.
-GLOBAL_MAX_AGE_S = 0.5
 
 
 def _within(low: float, high: float) -> Any:
@@ -141,16 +139,6 @@ class Pose:
 
 
 _POSE = TypeAdapter(Pose)
-
-
-def global_problem(state: VehicleState, now_ns: int) -> str | None:
-    """Why the vehicle's global position is unknown; None: it is known."""
-    if state.position_fault(now_ns) is not None or state.velocity_ned_mps is None:
-        return "own position unknown"
-    if not all(map(math.isfinite, (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m))):
-        return "own latitude and longitude unknown"
-    age_s = (now_ns - state.global_ns) / 1e9
-    return f"own latitude and longitude are {age_s:.1f} s old" if age_s > GLOBAL_MAX_AGE_S else None
 
 
 def pose_of(

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from companion.guidance.formation.neighbours import Anchor
 from companion.guidance.formation.pose import Structure
 from companion.guidance.path import Path
+from companion.vehicle.global_position import Anchor
 from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 

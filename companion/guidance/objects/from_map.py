@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.geometry.geodesy import north_east
 from companion.guidance.objects.from_detections import Pose, StateHistory, mount_at
+from companion.vehicle.global_position import Anchor
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.vision_position import VisionPosition
 from vision.attitude import euler_from_quaternion, wrap_angle
@@ -123,16 +123,11 @@ def map_origin_ned_m(origin: tuple[float, float, float] | None, state: VehicleSt
     """
     if origin is None:
         return (0.0, 0.0, 0.0)
-    values = (state.latitude_deg, state.longitude_deg, state.altitude_amsl_m)
-    if state.position_ned_m is None or not np.isfinite(values).all():
+    if (anchor := Anchor.newest(state)) is None:
         return None
-    # The two positions have different stamps.
-    later_s = (state.global_ns - state.position_ns) / 1e9
-    velocity = state.velocity_ned_mps or (0.0, 0.0, 0.0)
-    moved = zip(state.position_ned_m, state.reset_offset_ned_m, velocity, strict=True)
-    north, east, down = (place + offset + speed * later_s for place, offset, speed in moved)
-    away_north, away_east = north_east((state.latitude_deg, state.longitude_deg), origin[:2])
-    return (north + away_north, east + away_east, down + state.altitude_amsl_m - origin[2])
+    place = anchor.local(*origin)
+    north, east, down = (own + offset for own, offset in zip(place, state.reset_offset_ned_m, strict=True))
+    return (north, east, down)
 
 
 def position_from_map(

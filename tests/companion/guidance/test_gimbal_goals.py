@@ -226,7 +226,9 @@ def test_refused_command_gives_the_reason() -> None:
 )
 def test_place_needs_a_position(changes: dict[str, Any], reason: str) -> None:
     vehicle = flying()
-    located = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
+    located = replace(
+        vehicle.state, latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=490.0, global_ns=vehicle.now_ns
+    )
     pointing = Pointing(GlobalPoint(47.0001, 8.0))
     assert pointing.begin(BehaviourContext(vehicle.now_ns, located)) is None
     why = known(pointing.begin(BehaviourContext(vehicle.now_ns, replace(located, **changes))))
@@ -253,7 +255,9 @@ def test_ranged_object_needs_a_position_and_the_flight_goes_on(
 
 def test_place_is_given_up_without_a_position() -> None:
     vehicle = flying()
-    located = replace(vehicle.state, latitude_deg=47.0, longitude_deg=8.0, global_ns=vehicle.now_ns)
+    located = replace(
+        vehicle.state, latitude_deg=47.0, longitude_deg=8.0, altitude_amsl_m=490.0, global_ns=vehicle.now_ns
+    )
     pointing = Pointing(GlobalPoint(47.0001, 8.0))
     assert pointing.begin(BehaviourContext(vehicle.now_ns, located)) is None
     aim, later_ns = pointing.aim, vehicle.now_ns + round(LOST_AFTER_S * 1e9)

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Requirement
 from companion.guidance.formation.neighbours import (
-    Anchor,
     Neighbour,
     Neighbourhood,
     Neighbours,
@@ -19,6 +18,7 @@ from companion.guidance.formation.neighbours import (
 )
 from companion.guidance.formation.pose import Pose
 from companion.guidance.requirements import check_requirements
+from companion.vehicle.global_position import Anchor
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.test_pose import NOW_NS, STATE
 
@@ -128,8 +128,7 @@ def test_without_own_position_there_are_no_neighbours() -> None:
     others = neighbours.neighbourhood(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
     assert others.vehicles == ()
     assert others.problem is not None
-    assert "own latitude " in others.problem
-    assert "longitude unknown" in others.problem
+    assert others.problem == "latitude and longitude not received"
 
 
 class Needy(Behaviour):
@@ -162,10 +161,10 @@ def test_missing_neighbour_is_named_in_the_reply() -> None:
     assert alone.startswith("neighbours (")
     assert "not share poses" in alone
     lost = neighbours.neighbourhood(replace(state_at(NOW_NS), global_ns=0), NOW_NS)
-    assert "s old" in missing_neighbours(lost, (), state_at(NOW_NS), NOW_NS)[0]
+    assert "stale" in missing_neighbours(lost, (), state_at(NOW_NS), NOW_NS)[0]
     here = neighbours.neighbourhood(state_at(NOW_NS), NOW_NS)
     assert "than itself" in missing_neighbours(here, ("beta",), state_at(NOW_NS), NOW_NS)[0]
     # Without any other vehicle the own position is asked for when a behaviour needs it.
     nobody = Neighbourhood("beta")
     assert missing_neighbours(nobody, (), state_at(NOW_NS), NOW_NS) == []
-    assert "s old" in missing_neighbours(nobody, (), replace(state_at(NOW_NS), global_ns=0), NOW_NS)[0]
+    assert "stale" in missing_neighbours(nobody, (), replace(state_at(NOW_NS), global_ns=0), NOW_NS)[0]

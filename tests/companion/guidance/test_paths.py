@@ -85,7 +85,13 @@ def test_goto_by_latitude_needs_a_global_position() -> None:
 
 def test_goto_by_latitude_and_longitude() -> None:
     vehicle = KinematicVehicle()
-    state = replace(vehicle.state, global_ns=vehicle.now_ns, latitude_deg=47.397742, longitude_deg=8.545594)
+    state = replace(
+        vehicle.state,
+        global_ns=vehicle.now_ns,
+        latitude_deg=47.397742,
+        longitude_deg=8.545594,
+        altitude_amsl_m=490.0,
+    )
     behaviour = GotoBehaviour(Goto(latitude_deg=47.397742 + 1e-4, longitude_deg=8.545594))
     behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
     step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))

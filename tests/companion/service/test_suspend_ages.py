@@ -15,7 +15,7 @@ from companion.bench.lockstep_flight import plain_settings
 from companion.bus.vehicle_messages import pose_message
 from companion.clock import StandstillWatch
 from companion.guidance.core import Guidance
-from companion.guidance.formation.pose import Pose, global_problem
+from companion.guidance.formation.pose import Pose
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.mode_control import Phase
 from companion.perception.cameras import PerceptionCamera
@@ -24,6 +24,7 @@ from companion.service.guidance_loop import GuidanceLoop
 from companion.service.inputs import InputAssembler
 from companion.service.publisher import Publisher
 from companion.vehicle.gimbal import GimbalState
+from companion.vehicle.global_position import global_problem
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
 from companion.vehicle.streamer import Streamer
