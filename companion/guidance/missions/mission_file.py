@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -114,13 +113,8 @@ class MissionTable(BaseModel):
     step: Annotated[list[StepTable], Field(min_length=1, max_length=MOST_STEPS)]
 
 
-@dataclass(frozen=True, slots=True)
-class _Read:
-    """A step with its branches: the index of a step, or a word; None: the file is invalid there."""
-
-    table: StepTable
-    on_success: int | str | None
-    on_failure: int | str | None
+# What follows a step: the index of another one, or a word; None: the file is invalid there.
+_Branch = int | str | None
 
 
 def find_mission(name: str) -> Path:
@@ -188,16 +182,15 @@ def plan_from(
     except ValidationError as error:
         problems += [_problem_text(source, dict(problem)) for problem in error.errors()]
         steps = _readable_steps(written.get("step"), {problem["loc"][1:3] for problem in error.errors()})
-    read, commands = _read_steps(steps, source, class_names, problems)
-    if len(read) <= MOST_STEPS:  # the time of these grows with the square
-        problems += _unreached(read, source)
-        problems += _never_left(read, source)
+    branches, commands = _read_steps(steps, source, class_names, problems)
+    if len(steps) <= MOST_STEPS:  # the time of these grows with the square
+        problems += _branch_problems(steps, branches, source)
     if table is None or problems:
         raise MissionError(*problems)
     context = BuildContext(footprint, loop_rate_hz=loop_rate_hz)
     return Plan(
         name=table.name or Path(source).stem,
-        steps=tuple(_planned(*step, context) for step in zip(read, commands, strict=True)),
+        steps=tuple(_planned(*step, context) for step in zip(steps, branches, commands, strict=True)),
         way_down=lambda word: parse(word).build(NO_CONTEXT),
         timeout_s=table.timeout_s,
     )
@@ -227,10 +220,12 @@ def _shown(plan: Plan, follows: int | str) -> str:
     return follows if isinstance(follows, str) else f"{plan.steps[follows].title}"
 
 
-def _planned(step: _Read, command: Command, context: BuildContext) -> PlannedStep:
-    table = step.table
-    assert step.on_success is not None
-    assert step.on_failure is not None
+def _planned(
+    table: StepTable, branches: tuple[_Branch, ...], command: Command, context: BuildContext
+) -> PlannedStep:
+    on_success, on_failure = branches
+    assert on_success is not None
+    assert on_failure is not None
     return PlannedStep(
         title=table.name or str(command),
         command=str(command),
@@ -239,8 +234,8 @@ def _planned(step: _Read, command: Command, context: BuildContext) -> PlannedSte
         timeout_s=table.timeout_s,
         repeat=table.repeat,
         visits=table.visits,
-        on_success=step.on_success,
-        on_failure=step.on_failure,
+        on_success=on_success,
+        on_failure=on_failure,
     )
 
 
@@ -293,8 +288,11 @@ def _readable_steps(written: object, bad: set[tuple[int | str, ...]]) -> list[St
 
 def _read_steps(
     steps: Sequence[StepTable], source: str, class_names: Sequence[str] | None, problems: list[str]
-) -> tuple[list[_Read], list[Command]]:
-    """Return the branches of every step, and the valid commands. Errors are added to `problems`."""
+) -> tuple[list[tuple[_Branch, ...]], list[Command]]:
+    """Return the branches of every step (on success, on failure), and the valid commands.
+
+    Errors are added to `problems`.
+    """
     named: dict[str, int] = {}
     for index, step in enumerate(steps):
         if step.name is None:
@@ -305,10 +303,10 @@ def _read_steps(
         elif step.name in named:
             problems.append(f"{where}: name already used by step {named[step.name] + 1}")
         named.setdefault(step.name, index)
-    read, commands = [], []
+    branches, commands = list[tuple[_Branch, ...]](), []
     for index, step in enumerate(steps):
         where = f"{source}: {_called(index, step)}"
-        followers: list[int | str | None] = []
+        followers: list[_Branch] = []
         for key, word in (("on_success", step.on_success), ("on_failure", step.on_failure)):
             if word == CONTINUE:
                 followers.append(index + 1 if index + 1 < len(steps) else END)
@@ -320,7 +318,7 @@ def _read_steps(
                 known = [*_WORDS, *named]
                 problems.append(f"{where}: {key}: unknown step {word!r}; {near_names(word, known)}")
                 followers.append(None)
-        read.append(_Read(step, *followers))
+        branches.append(tuple(followers))
         if step.do is None:
             continue
         try:
@@ -333,61 +331,49 @@ def _read_steps(
             problems.append(f"{where}: a mission cannot start another mission")
         if command.endless and step.timeout_s is None:
             problems.append(f"{where}: {step.do!r} does not end by itself; set timeout_s")
-    return read, commands
+    return branches, commands
 
 
-def _unreached(read: Sequence[_Read], source: str) -> list[str]:
-    """A line for every unreachable step."""
-    reached = {0} | (_reach(read, 0) if read else set())
-    return [
-        f"{source}: {_called(index, step.table)}: unreachable"
-        for index, step in enumerate(read)
-        if index not in reached
-    ]
-
-
-def _never_left(read: Sequence[_Read], source: str) -> list[str]:
-    """A line for every loop of steps that only a failure of the whole mission would end.
+def _branch_problems(
+    steps: Sequence[StepTable], branches: Sequence[tuple[_Branch, ...]], source: str
+) -> list[str]:
+    """A line for every unreachable step, and for every loop that only a failure of the mission would end.
 
     A loop is valid if one of its branches leads out of it, other than to `abort`, or one of its steps limits
     its visits.
     """
-    reach = [_reach(read, index) for index in range(len(read))]
-    problems, reported = [], set[int]()
-    for index in range(len(read)):
+    reach = [_reach(branches, index) for index in range(len(steps))]
+    reached = {0}.union(*reach[:1])
+    problems = [
+        f"{source}: {_called(index, step)}: unreachable"
+        for index, step in enumerate(steps)
+        if index not in reached
+    ]
+    reported = set[int]()
+    for index in range(len(steps)):
         if index in reported or index not in reach[index]:
             continue
         loop = {other for other in reach[index] if index in reach[other]}
         reported |= loop
-        exits = {
-            follows
-            for step in loop
-            for follows in (read[step].on_success, read[step].on_failure)
-            if follows not in loop and follows != ABORT
-        }
-        if exits or any(read[step].table.visits is not None for step in loop):
+        exits = {follows for step in loop for follows in branches[step]} - loop - {ABORT}
+        if exits or any(steps[step].visits is not None for step in loop):
             continue
-        names = ", ".join(_called(step, read[step].table) for step in sorted(loop))
+        names = ", ".join(_called(step, steps[step]) for step in sorted(loop))
         problems.append(
             f"{source}: {names}: loop without exit; add a branch out of it, or set visits on one of its steps"
         )
     return problems
 
 
-def _reach(read: Sequence[_Read], start: int) -> set[int]:
-    """All steps that can follow a step."""
-    reached: set[int] = set()
-    waiting = [start]
+def _reach(branches: Sequence[tuple[_Branch, ...]], start: int) -> set[int]:
+    """All steps that can follow a step: any, where a branch is not known."""
+    reached, waiting = set[int](), [start]
     while waiting:
-        fresh = _steps_after(read, waiting.pop()) - reached
+        follows = branches[waiting.pop()]
+        known = (
+            range(len(branches)) if None in follows else (each for each in follows if isinstance(each, int))
+        )
+        fresh = set(known) - reached
         reached |= fresh
         waiting += fresh
     return reached
-
-
-def _steps_after(read: Sequence[_Read], index: int) -> set[int]:
-    """The steps that can follow a step; all, if a branch of it is not known."""
-    branches = (read[index].on_success, read[index].on_failure)
-    if None in branches:
-        return set(range(len(read)))
-    return {follows for follows in branches if isinstance(follows, int)}
