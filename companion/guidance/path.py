@@ -20,7 +20,7 @@ ACCELERATION_MPS2 = 1.0
 # A corner is flown as a bend: the turn of the path within this distance before and after a point.
 BEND_M = 1.0
 SPACING_M = 0.25
-SAME_M = 0.01
+SAME_M, ABOVE_M = 0.01, 0.05
 SLOWEST_MPS = 0.4
 # Delay of a multirotor's velocity: the command is the path's direction that far ahead.
 DELAY_S = 0.4
@@ -54,7 +54,8 @@ class Path:
     """A path with its speed profile.
 
     Args:
-        points: at least two, local NED metres; repeated points are skipped.
+        points: local NED metres; repeated points are skipped. A path needs a length: of a single point it
+            begins 5 cm above.
         speed_mps: along straight lines.
         closed: a loop from the last point back to the first, without slowing down for an end.
 
@@ -62,17 +63,18 @@ class Path:
         length_m: of one lap. speed_mps: as given.
 
     Raises:
-        ValueError: fewer than two different points, longer than `LONGEST_M`, or a loop shorter than
-            `SHORTEST_LAP_M`.
+        ValueError: no points, longer than `LONGEST_M`, or a loop shorter than `SHORTEST_LAP_M`.
     """
 
     def __init__(self, points: Sequence[Vector3], speed_mps: float, *, closed: bool = False) -> None:
-        corners = [points[0]] if points else []
+        if not points:
+            raise ValueError("a path needs a point")
+        corners = [points[0]]
         for point in (*points, *points[:1]) if closed else points:
             if math.dist(point, corners[-1]) >= SAME_M:
                 corners.append(point)
         if len(corners) < 2:
-            raise ValueError("a path needs at least two different points")
+            corners.insert(0, (corners[0][0], corners[0][1], corners[0][2] - ABOVE_M))
         self.closed, self.speed_mps = closed, speed_mps
         length_m = sum(math.dist(a, b) for a, b in pairwise(corners))
         if not length_m <= LONGEST_M:

@@ -10,7 +10,6 @@ from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command, EnumArgument, Number, behaviour
 from companion.guidance.motion import laps_text, position_and_yaw
-from companion.guidance.path import Path
 from companion.vehicle.state import Vector3
 
 _POINTS = 96
@@ -38,17 +37,12 @@ class FigureEightBehaviour(PathFlight):
     name = "figure-eight"
 
     def __init__(self, radius_m: float, speed_mps: float, laps: float, *, nose_along: bool = True) -> None:
-        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
+        super().__init__(speed_mps, closed=True, laps=laps, nose_along=nose_along)
         self._radius_m = radius_m
 
-    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """See Behaviour."""
+    def _points(self, context: BehaviourContext) -> list[Vector3]:
         centre, yaw_rad = position_and_yaw(context.state)
-        return tuple(lemniscate(centre, yaw_rad, self._radius_m))
-
-    def _path(self, context: BehaviourContext) -> Path:
-        centre, yaw_rad = position_and_yaw(context.state)
-        return Path(lemniscate(centre, yaw_rad, self._radius_m), self._speed_mps, closed=True)
+        return lemniscate(centre, yaw_rad, self._radius_m)
 
     def _success_text(self) -> str:
         return f"{laps_text(self._laps)} of the eight flown"

@@ -18,7 +18,6 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.motion import home_of, laps_text, position_and_yaw
-from companion.guidance.path import Path
 from companion.vehicle.state import Vector3
 
 
@@ -65,31 +64,19 @@ class FollowPathBehaviour(PathFlight):
         nose_along: bool = True,
         round_trip: bool = False,
     ) -> None:
-        super().__init__(speed_mps, laps=laps, nose_along=nose_along)
-        self._points = tuple(points)
-        self._round_trip = round_trip or laps != 1.0
+        super().__init__(speed_mps, closed=round_trip or laps != 1.0, laps=laps, nose_along=nose_along)
+        self._from_home = tuple(points)
 
-    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """See Behaviour."""
-        return tuple(self._points_ned(context))
-
-    def _points_ned(self, context: BehaviourContext) -> list[Vector3]:
+    def _points(self, context: BehaviourContext) -> list[Vector3]:
         position, _ = position_and_yaw(context.state)
         home = home_of(context.state)
         down, points = position[2], list[Vector3]()
-        for north, east, *height in self._points:
+        for north, east, *height in self._from_home:
             down = home[2] - height[0] if height else down
             points.append((home[0] + north, home[1] + east, down))
         return points
 
-    def _path(self, context: BehaviourContext) -> Path:
-        position, _ = position_and_yaw(context.state)
-        points = self._points_ned(context)
-        if self._round_trip:
-            return Path(points, self._speed_mps, closed=True)
-        return Path([position, *points], self._speed_mps)
-
     def _success_text(self) -> str:
-        if not self._round_trip:
-            return f"all {len(self._points)} points flown"
-        return f"{laps_text(self._laps)} of {len(self._points)} points flown"
+        if not self._closed:
+            return f"all {len(self._from_home)} points flown"
+        return f"{laps_text(self._laps)} of {len(self._from_home)} points flown"

@@ -9,10 +9,7 @@ from companion.guidance.behaviour import Behaviour, BehaviourContext
 from companion.guidance.behaviours.path_flight import PathFlight
 from companion.guidance.command import BuildContext, Command, GrammarError, Number, behaviour
 from companion.guidance.motion import home_of, local_from_global, position_and_yaw
-from companion.guidance.path import Path
 from companion.vehicle.state import Vector3
-
-NEAREST_M = 0.05
 
 
 @behaviour(
@@ -75,36 +72,21 @@ class GotoBehaviour(PathFlight):
         super().__init__(command.speed_mps, heading_rad=heading_rad)
         self._command = command
 
-    def _path(self, context: BehaviourContext) -> Path:
-        position, _ = position_and_yaw(context.state)
-        goal = self._goal(context)
-        if math.dist(goal, position) < NEAREST_M:
-            # A path needs a length: at the goal already, it starts 5 cm above.
-            position = (goal[0], goal[1], goal[2] - NEAREST_M)
-        return Path([position, goal], self._speed_mps)
-
-    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
-        """See Behaviour."""
-        try:
-            return (self._goal(context),)
-        except ValueError:
-            return ()  # reported when it begins
-
-    def _goal(self, context: BehaviourContext) -> Vector3:
+    def _points(self, context: BehaviourContext) -> list[Vector3]:
         state, command = context.state, self._command
         position, yaw_rad = position_and_yaw(state)
         down = position[2] if command.altitude_m is None else home_of(state)[2] - command.altitude_m
         if command.north_m is not None and command.east_m is not None:
             home = home_of(state)
-            return (home[0] + command.north_m, home[1] + command.east_m, down)
+            return [(home[0] + command.north_m, home[1] + command.east_m, down)]
         if command.forward_m is not None and command.right_m is not None:
             north = command.forward_m * math.cos(yaw_rad) - command.right_m * math.sin(yaw_rad)
             east = command.forward_m * math.sin(yaw_rad) + command.right_m * math.cos(yaw_rad)
-            return (position[0] + north, position[1] + east, down)
+            return [(position[0] + north, position[1] + east, down)]
         assert command.latitude_deg is not None
         assert command.longitude_deg is not None
         place = (command.latitude_deg, command.longitude_deg)
-        return (*local_from_global(state, context.now_ns, place), down)
+        return [(*local_from_global(state, context.now_ns, place), down)]
 
     def _success_text(self) -> str:
         return "goal reached"

@@ -26,6 +26,7 @@ from companion.guidance.motion import (
 )
 from companion.guidance.path import Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
+from companion.vehicle.state import Vector3
 from vision.attitude import wrap_angle
 
 # Within this distance of its end, the end is flown to as a point, see `PositionController`.
@@ -49,10 +50,11 @@ KEEP_NOSE_M = 2.0
 
 
 class PathFlight(Behaviour):
-    """Flies the path that `_path` builds at the start.
+    """Flies along the points that `_points` returns at the start.
 
     Args:
         speed_mps: along it, at most.
+        closed: a loop through the points; else from the vehicle to the last one.
         laps: of a closed path; 0: until another command.
         heading_rad: constant yaw; None: along the path if `nose_along`, else unchanged.
     """
@@ -63,11 +65,12 @@ class PathFlight(Behaviour):
         self,
         speed_mps: float,
         *,
+        closed: bool = False,
         laps: float = 1.0,
         nose_along: bool = True,
         heading_rad: float | None = None,
     ) -> None:
-        self._speed_mps, self._laps = speed_mps, laps
+        self._speed_mps, self._closed, self._laps = speed_mps, closed, laps
         self._nose_along, self._heading_rad = nose_along, heading_rad
         self._follower: PathFollower | None = None
         self._problem = ""
@@ -78,19 +81,28 @@ class PathFlight(Behaviour):
         self._arrival, self._controller = Arrival(), PositionController()
 
     @abstractmethod
-    def _path(self, context: BehaviourContext) -> Path:
-        """Build the path from the vehicle's position. Raises ValueError with the reason if there is none."""
+    def _points(self, context: BehaviourContext) -> list[Vector3]:
+        """The points to fly along, local NED metres. Raises ValueError with the reason if there are none."""
 
     @abstractmethod
     def _success_text(self) -> str:
         """The reason of a successful outcome."""
 
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
+        """See Behaviour."""
+        try:
+            return tuple(self._points(context))
+        except ValueError:
+            return ()  # reported when it begins
+
     def on_activate(self, context: BehaviourContext) -> None:
-        _, self._yaw_rad = position_and_yaw(context.state)
+        position, self._yaw_rad = position_and_yaw(context.state)
         self._follower, self._problem = None, ""
         self.resume(context)
         try:
-            self._follower = PathFollower(self._path(context), self._laps)
+            points = self._points(context)
+            points = points if self._closed else [position, *points]
+            self._follower = PathFollower(Path(points, self._speed_mps, closed=self._closed), self._laps)
         except ValueError as error:
             self._problem = str(error)
 

@@ -23,7 +23,6 @@ from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, Gim
 from companion.guidance.motion import Standing, in_degrees, laps_text, position_and_yaw
 from companion.guidance.objects.target import DOUBTED
 from companion.guidance.objects.tracked_object import FOUND_FRAMES, TrackedObject
-from companion.guidance.path import Path
 from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.setpoint import Setpoint
@@ -402,7 +401,7 @@ class SearchBehaviour(PathFlight):
             return f"facing the {self._command.class_name}"
         return f"searching an area for a {self._command.class_name}{super().status.removeprefix(self.name)}"
 
-    def _path(self, context: BehaviourContext) -> Path:
+    def _points(self, context: BehaviourContext) -> list[Vector3]:
         position, _ = position_and_yaw(context.state)
         command, spacing_m = self._command, self._command.spacing_m
         if spacing_m is None:
@@ -415,10 +414,9 @@ class SearchBehaviour(PathFlight):
             assert command.width_m is not None
             assert command.height_m is not None
             points = lawnmower(command.width_m, command.height_m, spacing_m)
-        path = [(position[0] + north, position[1] + east, position[2]) for north, east in points]
         if command.radius_m is not None and len(points) == 1:
             raise ValueError(f"one strip of {spacing_m:.0f} m covers the area: use pattern=turn")
-        return Path([position, *path], self._speed_mps)
+        return [(position[0] + north, position[1] + east, position[2]) for north, east in points]
 
     def _success_text(self) -> str:
         return "whole area searched"

@@ -76,9 +76,6 @@ class VirtualStructure:
         for north, east, *height in self._points:
             height_m = height[0] if height else height_m
             positions.append((origin_ned[0] + north, origin_ned[1] + east, origin_ned[2] - height_m))
-        if len(positions) == 1:
-            # One point is a position to hold: a path needs a length, so it starts 5 cm above.
-            positions.insert(0, (positions[0][0], positions[0][1], positions[0][2] - 0.05))
         self._path = Path(positions, self._speed_mps, closed=self._laps != 1.0)
 
     def leave(self) -> None:

@@ -12,7 +12,7 @@ from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour
 from companion.guidance.behaviours.patrol import Patrol, PatrolBehaviour
-from companion.guidance.behaviours.seek import Seek, SeekBehaviour
+from companion.guidance.behaviours.seek import SearchBehaviour, Seek, SeekBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import EventKind
@@ -116,6 +116,10 @@ def test_late_detector_allows_seek_but_does_not_steer_it() -> None:
         (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), "-7000.0 m east"),
         (PatrolBehaviour(Patrol("0,0 4000,0", "car")), "4000.0 m north"),
         (FigureEightBehaviour(6000.0, 3.0, 1.0), "guidance.max_distance_m"),
+        (
+            SearchBehaviour(Seek("car", pattern="lawnmower", width_m=900.0, height_m=20.0, spacing_m=9.0)),
+            "guidance.max_distance_m",
+        ),
         (GotoBehaviour(Goto(north_m=0.0, east_m=0.0, altitude_m=90.0)), "guidance.max_altitude_m = 50"),
         (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 0.2)], 3.0), "guidance.min_altitude_m = 1"),
         (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 60.0)], 3.0), "60.0 m above"),
