@@ -13,7 +13,6 @@ from companion.guidance.behaviour import (
     Requirement,
 )
 from companion.guidance.behaviours.approach import LOST_AFTER_S
-from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import (
     BuildContext,
     Command,
@@ -22,7 +21,7 @@ from companion.guidance.command import (
     Number,
     behaviour,
 )
-from companion.guidance.motion import Arrival, position_and_yaw, speed_of
+from companion.guidance.motion import Arrival, Standing, position_and_yaw, speed_of
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.policy_file import LoadedPolicy, PolicyError, Quantity, find_policy, load_policy
@@ -128,7 +127,7 @@ class PolicyBehaviour(Behaviour):
     def _begin(self, now_ns: int) -> None:
         self._arrival = Arrival()
         self._object: TrackedObject | None = None
-        self._hold: HoldBehaviour | None = None
+        self._standing: Standing | None = None
         self._action = dict.fromkeys(ACTIONS, 0.0)
         self._begun_ns = self._due_ns = now_ns
         self._range_m = math.nan
@@ -158,7 +157,7 @@ class PolicyBehaviour(Behaviour):
             return Outcome(False, f"{self._policy.name} ended: {fault}" + (f" ({why})" if why else ""))
         if lost:
             return self._wait(dt_s, context)
-        self._hold = None
+        self._standing = None
         # A little early rather than a whole update late.
         if context.now_ns >= self._due_ns - 5_000_000:
             period_ns = round(1e9 / self._policy.description.rate_hz)
@@ -171,10 +170,9 @@ class PolicyBehaviour(Behaviour):
 
     def _wait(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         """Brake, and hold where the vehicle comes to rest."""
-        if self._hold is None:
-            self._hold, self._arrival = HoldBehaviour(), Arrival()
-            self._hold.on_activate(context)
-        return self._hold.update(dt_s, context)
+        if self._standing is None:
+            self._standing, self._arrival = Standing(), Arrival()
+        return self._standing.setpoint(context.state, context.now_ns, dt_s, None)
 
     def _observation(
         self, seen: TrackedObject, context: BehaviourContext, position: Vector3, yaw_rad: float
@@ -215,7 +213,7 @@ class PolicyBehaviour(Behaviour):
     def status(self) -> str:
         if self._object is None:
             return f"policy {self._policy.name}, looking for {self.subject.phrase}"
-        if self._hold is not None:
+        if self._standing is not None:
             return f"policy {self._policy.name}, lost {self.subject.phrase}, waiting"
         return f"policy {self._policy.name}, {self.subject.name} {self._range_m:.1f} m away"
 

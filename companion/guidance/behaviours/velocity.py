@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Annotated
 
 from companion.guidance.behaviour import (
@@ -13,12 +12,12 @@ from companion.guidance.behaviour import (
     Requirement,
     VelocityInput,
 )
-from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.command import BuildContext, Command, Word, behaviour
 from companion.guidance.formation.pose import turn_rate
 from companion.guidance.motion import (
     HOLD_VELOCITY_GAIN,
     MAX_CORRECTION_MPS,
+    Standing,
     add_velocity_error,
     correction,
     position_and_yaw,
@@ -62,7 +61,7 @@ class VelocityBehaviour(Behaviour):
     def __init__(self, source: str | None = None) -> None:
         self._source = source
         self._others: set[str] = set()
-        self._hold: HoldBehaviour | None = None
+        self._standing: Standing | None = None
         self._down_m: float | None = None
         self._yaw_rad: float | None = None
         self._received_ns: int | None = None
@@ -81,17 +80,19 @@ class VelocityBehaviour(Behaviour):
         message = self._message(context)
         turn_radps = 0.0 if message is None else message.turn_radps
         if message is None or not (message.forward_mps or message.right_mps or message.up_mps):
-            setpoint = self._held(dt_s, context)
+            if self._standing is None:
+                self._standing, self._down_m = Standing(), None
+            velocity = self._standing.velocity(context.state, dt_s)
         else:
-            self._hold = None
-            setpoint = Setpoint.velocity(self._velocity(message, context.state), context.now_ns)
+            self._standing = None
+            velocity = self._velocity(message, context.state)
         # After a turn the heading is held where the turn ends.
         if turn_radps or (self._yaw_rad is None and abs(turn_rate(context.state)) > TURNED_RADPS):
             self._yaw_rad = None
-            return replace(setpoint, yaw_rad=None, yaw_rate_radps=turn_radps)
+            return Setpoint.velocity(velocity, context.now_ns, yaw_rate_radps=turn_radps)
         if self._yaw_rad is None:
             _, self._yaw_rad = position_and_yaw(context.state)
-        return replace(setpoint, yaw_rad=self._yaw_rad)
+        return Setpoint.velocity(velocity, context.now_ns, yaw_rad=self._yaw_rad)
 
     def _message(self, context: BehaviourContext) -> VelocityInput | None:
         """The message to fly; None: there is no valid one."""
@@ -112,14 +113,6 @@ class VelocityBehaviour(Behaviour):
             if self._silent:
                 self.add_notes(f"{self._source} is silent: holding")
         return own
-
-    def _held(self, dt_s: float, context: BehaviourContext) -> Setpoint:
-        if self._hold is None:
-            self._hold, self._down_m = HoldBehaviour(), None
-            self._hold.on_activate(context)
-        step = self._hold.update(dt_s, context)
-        assert isinstance(step, Setpoint)  # it holds until another command
-        return step
 
     def _velocity(self, message: VelocityInput, state: VehicleState) -> Vector3:
         """In local NED; without a vertical part the height is held.
