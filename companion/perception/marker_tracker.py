@@ -9,13 +9,6 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 from companion.guidance.objects.from_detections import HistoryError, StateHistory, mount_at
-from companion.guidance.objects.from_map import (
-    TURNED_RAD,
-    VisionGate,
-    map_origin_ned_m,
-    position_from_map,
-    tilt_error_rad,
-)
 from companion.guidance.objects.from_markers import (
     CONFIRM_FRAMES,
     CONFIRM_GAP_S,
@@ -31,6 +24,13 @@ from companion.guidance.objects.from_markers import (
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.tracked_object import TrackedObject
 from companion.perception.cameras import PerceptionCamera
+from companion.perception.map_position import (
+    TURNED_RAD,
+    VisionGate,
+    map_origin_ned_m,
+    position_from_map,
+    tilt_error_rad,
+)
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vision_position import VisionPosition
 from vision.marker_ambiguity import AmbiguityResolver

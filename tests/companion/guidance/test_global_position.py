@@ -9,7 +9,7 @@ import pytest
 from companion.bus.vehicle_messages import geodetic_origin
 from companion.guidance.formation.neighbours import Neighbours
 from companion.guidance.motion import local_from_global
-from companion.guidance.objects.from_map import map_origin_ned_m
+from companion.perception.map_position import map_origin_ned_m
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import known
 from tests.companion.guidance.test_neighbours import state_at

@@ -12,10 +12,10 @@ import pytest
 
 from benchmarks.rendered import camera_settings
 from companion.guidance.objects.from_detections import StateHistory
-from companion.guidance.objects.from_map import DRIFT_MPS, ESTIMATE_MARGIN_M, VisionGate
 from companion.guidance.objects.from_markers import LocalizedMarkers
 from companion.perception.assembly import marker_finder
 from companion.perception.cameras import PerceptionCamera
+from companion.perception.map_position import DRIFT_MPS, ESTIMATE_MARGIN_M, VisionGate
 from companion.perception.marker_tracker import MarkerTracker
 from companion.settings.reading import ConfigurationError, load_settings
 from companion.vehicle.state import Vector3, VehicleState, with_fields

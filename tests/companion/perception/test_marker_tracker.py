@@ -14,10 +14,10 @@ from benchmarks.rendered import camera_settings
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.behaviours.land_on_marker import LandOnMarkerBehaviour
 from companion.guidance.objects.from_detections import StateHistory
-from companion.guidance.objects.from_map import VisionGate
 from companion.guidance.objects.from_markers import LocalizedMarkers
 from companion.guidance.requirements import check_requirements
 from companion.perception.cameras import PerceptionCamera
+from companion.perception.map_position import VisionGate
 from companion.perception.marker_tracker import MarkerTracker
 from companion.vehicle.state import VehicleState
 from companion.vehicle.vision_position import VisionPosition

@@ -14,7 +14,7 @@ from companion.bench.lockstep_flight import TICK_S, LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.geometry.geodesy import latitude_longitude
 from companion.guidance.objects.from_detections import StateHistory
-from companion.guidance.objects.from_map import map_origin_ned_m, position_from_map
+from companion.perception.map_position import map_origin_ned_m, position_from_map
 from companion.settings.marker_files import read_map
 from companion.vehicle.state import Vector3, VehicleState
 from companion.vehicle.vision_position import VisionPosition, vision_position_fields
