@@ -6,7 +6,6 @@ A lost object of a class is searched where it was last seen, then by a full turn
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Annotated
 
 from companion.guidance.behaviour import (
@@ -66,27 +65,6 @@ LOST_AFTER_S = 1.0
 # Nearer than this the bearing to the object's nearest point is too noisy to follow.
 MIN_YAW_RANGE_M = 1.0
 BASE_TIMEOUT_S = 45.0
-# How long to look at the last known position, once the nose points there.
-LOOK_BACK_S = 3.0
-# Time for half a turn at the slowest useful yaw rate.
-LOOK_BACK_LIMIT_S = 12.0
-POINTED_RAD = math.radians(6.0)
-
-
-@dataclass(slots=True)
-class _Search:
-    """The search for a lost object: first where it was, then by a full turn.
-
-    Attributes:
-        why: how it was lost. pointed_ns: since when the nose points to `lost_at`; None: not yet.
-        seek: the turn; None: not begun.
-    """
-
-    why: str
-    lost_at: Vector3
-    begun_ns: int
-    pointed_ns: int | None = None
-    seek: SeekBehaviour | None = None
 
 
 @behaviour(
@@ -149,7 +127,8 @@ class ApproachBehaviour(Behaviour):
         self._forget(0, 0.0)
 
     def _forget(self, now_ns: int, down_m: float) -> None:
-        self._search: _Search | None = None
+        self._seek: SeekBehaviour | None = None
+        self._lost = "", (0.0, 0.0, 0.0)
         self._object: TrackedObject | None = None
         self._started_ns, self._down_m = now_ns, down_m
         self._until_ns = now_ns + BASE_TIMEOUT_S * 1e9
@@ -171,8 +150,8 @@ class ApproachBehaviour(Behaviour):
             self._tracking.begin(context)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        if self._search is not None:
-            return self._look_for_it(self._search, dt_s, context)
+        if self._seek is not None:
+            return self._search(self._seek, dt_s, context)
         now_ns, state = context.now_ns, context.state
         position, yaw_rad = position_and_yaw(state)
         self._observe(context)
@@ -225,7 +204,7 @@ class ApproachBehaviour(Behaviour):
 
     @property
     def approached(self) -> Approached | None:
-        if self._object is None or self._search is not None:
+        if self._object is None or self._seek is not None:
             return None
         return Approached(self._object.detection)
 
@@ -233,13 +212,12 @@ class ApproachBehaviour(Behaviour):
     def gimbal_aim(self) -> GimbalAim | None:
         if self._tracking is None:
             return None
-        seek = None if self._search is None else self._search.seek
-        return (None if seek is None else seek.gimbal_aim) or self._tracking.aim
+        return (None if self._seek is None else self._seek.gimbal_aim) or self._tracking.aim
 
     @property
     def status(self) -> str:
-        if self._search is not None:
-            doing = "where it was" if self._search.seek is None else "all around"
+        if self._seek is not None:
+            doing = "where it was" if self._seek.looks_first else "all around"
             return f"lost {self.subject.phrase}, searching {doing} ({self._tried} of {self._retries})"
         if self._object is None:
             return f"looking for {self.subject.phrase}"
@@ -304,40 +282,27 @@ class ApproachBehaviour(Behaviour):
         self._tried += 1
         self.add_notes(f"approach: {why}; searching, {self._tried} of {self._retries}")
         context.objects.forget(self.subject)
-        self._search = search = _Search(why, lost_at, context.now_ns)
-        return self._look_back(search, 0.0, context)
+        self._lost = why, lost_at
+        turn = Seek(self.subject.class_name, laps=1.0, confidence=self._command.confidence)
+        self._seek = SeekBehaviour(turn, sweep=self._sweep(), first_at=lost_at)
+        self._seek.on_activate(context)
+        return self._search(self._seek, 0.0, context)
 
-    def _look_for_it(self, search: _Search, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+    def _search(self, seek: SeekBehaviour, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
+        """Look for the lost object, and approach what is found."""
         if self._tracking is not None and (why := self._tracking.control_fault(context)) is not None:
             return Outcome(False, f"approach lost the gimbal: {why}")
-        if search.seek is None:
-            return self._look_back(search, dt_s, context)
-        step = search.seek.update(dt_s, context)
+        step = seek.update(dt_s, context)
         if not isinstance(step, Outcome):
             return step
         if step.success:
-            return self._go_there(context, step.reason)
+            self.add_notes(f"approach: {step.reason}")
+            self._begin(context)
+            return self.update(0.0, context)
+        why, lost_at = self._lost
         if not context.perception_fresh:
-            return Outcome(False, f"{search.why}; {step.reason}")
-        return self._look_again(search.why, search.lost_at, context)
-
-    def _look_back(self, search: _Search, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
-        """Hold with the nose towards the last known position; then turn."""
-        now_ns = context.now_ns
-        position, yaw_rad = position_and_yaw(context.state)
-        if context.objects.of(self.subject, self._command.confidence) is not None:
-            return self._go_there(context, f"found {self.subject.phrase} where it was")
-        bearing_rad = math.atan2(search.lost_at[1] - position[1], search.lost_at[0] - position[0])
-        if search.pointed_ns is None and abs(wrap_angle(bearing_rad - yaw_rad)) < POINTED_RAD:
-            search.pointed_ns = now_ns
-        looked_ns = 0 if search.pointed_ns is None else now_ns - search.pointed_ns
-        if looked_ns > LOOK_BACK_S * 1e9 or now_ns - search.begun_ns > LOOK_BACK_LIMIT_S * 1e9:
-            turn = Seek(self.subject.class_name, laps=1.0, confidence=self._command.confidence)
-            search.seek = SeekBehaviour(turn, sweep=self._sweep())
-            search.seek.on_activate(context)
-            return search.seek.update(0.0, context)
-        self._standing = self._standing or Standing()
-        return self._standing.setpoint(context.state, now_ns, dt_s, bearing_rad)
+            return Outcome(False, f"{why}; {step.reason}")
+        return self._look_again(why, lost_at, context)
 
     def _sweep(self) -> GimbalSweep | None:
         """A sweep between the pitch at which the object was lost and level."""
@@ -345,8 +310,3 @@ class ApproachBehaviour(Behaviour):
         if aim is None or abs(math.degrees(aim.pitch_rad)) < LEAST_SWEEP_DEG:
             return None
         return GimbalSweep(aim.pitch_rad, math.radians(USUAL_RATE_DPS), self._field_rad)
-
-    def _go_there(self, context: BehaviourContext, note: str) -> BehaviourOutput:
-        self.add_notes(f"approach: {note}")
-        self._begin(context)
-        return self.update(0.0, context)

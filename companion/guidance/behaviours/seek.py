@@ -43,6 +43,8 @@ SIGHT_FRESH_S = 0.7
 # Within this angle of nose and gimbal the camera sees the object.
 POINTED_RAD = math.radians(8.0)
 BLIND_TIMEOUT_S = 5.0
+# How long to look at a point before the turn, once the nose points there; and time for half a turn.
+FIRST_S, FIRST_LIMIT_S = 3.0, 12.0
 # Time-out of a turn relative to its nominal time, plus the time to face false finds.
 SLOWEST_TURN = 3.0
 MOST_FALSE_FINDS = 5
@@ -198,12 +200,24 @@ class SeekBehaviour(Behaviour):
             if that is lost; later finds are faced at once. False: the first find is faced at once.
         sweep: the gimbal's motion during the turn, which limits the turn rate; it then points at the find.
             None: the gimbal is not used.
+        first_at: a point (local NED) to look at before the turn; None: none.
+
+    Attributes:
+        looks_first: it looks there, and has not turned yet.
     """
 
     name = "seek"
     requirements = frozenset({Requirement.POSITION, Requirement.IN_AIR, Requirement.PERCEPTION})
 
-    def __init__(self, command: Seek, *, whole_turn: bool = False, sweep: GimbalSweep | None = None) -> None:
+    def __init__(
+        self,
+        command: Seek,
+        *,
+        whole_turn: bool = False,
+        sweep: GimbalSweep | None = None,
+        first_at: Vector3 | None = None,
+    ) -> None:
+        self._first_at = first_at
         self._command, self._sweep, self._rate_radps = command, sweep, command.rate_radps
         if sweep is not None:
             self.requirements = SeekBehaviour.requirements | {Requirement.GIMBAL}
@@ -218,6 +232,7 @@ class SeekBehaviour(Behaviour):
         self._begun_ns, self._standing, self._yaw_rad = now_ns, Standing(), yaw_rad
         turn_s = self._command.laps * math.tau / self._rate_radps
         limit_s = SLOWEST_TURN * turn_s + MOST_FALSE_FINDS * FACING_TIMEOUT_S
+        self.looks_first, self._pointed_ns = self._first_at is not None, math.inf
         self._give_up_ns = now_ns + limit_s * 1e9
         self._turned_rad = 0.0
         self._compared = self._doubted = False
@@ -236,7 +251,7 @@ class SeekBehaviour(Behaviour):
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         now_ns = context.now_ns
-        _, yaw_rad = position_and_yaw(context.state)
+        position, yaw_rad = position_and_yaw(context.state)
         self._turned_rad += self._turn * wrap_angle(yaw_rad - self._yaw_rad)
         self._yaw_rad = yaw_rad
         stay = self._standing.velocity(context.state, dt_s)
@@ -257,6 +272,15 @@ class SeekBehaviour(Behaviour):
             self._facing = Facing(best, now_ns)
         if self._facing is not None:
             return self._face(self._facing, stay, dt_s, context) or wait
+        if self.looks_first and self._first_at is not None:
+            north, east = self._first_at[0] - position[0], self._first_at[1] - position[1]
+            bearing_rad = math.atan2(east, north)
+            if abs(wrap_angle(bearing_rad - yaw_rad)) < POINTED_RAD:
+                self._pointed_ns = min(self._pointed_ns, now_ns)
+            until_ns = min(self._pointed_ns + FIRST_S * 1e9, self._begun_ns + FIRST_LIMIT_S * 1e9)
+            if now_ns <= until_ns:
+                return Setpoint.velocity(stay, now_ns, yaw_rad=bearing_rad)
+            self.looks_first, self._turned_rad = False, 0.0
         if abs(self._turned_rad) >= self._command.laps * math.tau:
             why = f": {DOUBTED}" if self._doubted else ""
             self._failure = f"no {self._command.class_name} found in {laps_text(self._command.laps)}{why}"

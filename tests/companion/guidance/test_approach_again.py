@@ -8,6 +8,7 @@ from companion.guidance.command import NO_CONTEXT
 from companion.guidance.grammar import parse
 from tests.companion.guidance.guidance_harness import Flight, assert_failed
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
+from vision.attitude import wrap_angle
 
 Each = Callable[[float, Flight], None]
 
@@ -31,15 +32,18 @@ def active(
 
 def test_object_that_reappears_is_approached_again() -> None:
     car = SeenObject("car", 30.0, 0.0)
+    turned_rad = [0.0]
 
     def each(seconds: float, flight: Flight) -> None:
-        car.visible = not 5.0 < seconds < 11.0
+        car.visible = not 5.0 < seconds < 12.5
+        turned_rad.append(abs(wrap_angle(flight.vehicle.yaw_rad)))
 
     outcome, notes, flight = active("approach car", car, each)
     assert outcome.success, outcome.reason
     assert len(notes) == 2
     assert "1 of 2" in notes[0]
-    assert "found the car" in notes[1]
+    assert "found a car: bearing 0" in notes[1]
+    assert max(turned_rad) < 0.1  # it is found where it was, before a turn
     assert math.dist(flight.vehicle.position[:2], (30.0, 0.0)) == pytest.approx(5.0, abs=0.4)
 
 
