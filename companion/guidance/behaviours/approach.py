@@ -161,7 +161,7 @@ class ApproachBehaviour(Behaviour):
             north, east, _ = point
             self._range_m = math.hypot(north - position[0], east - position[1])
         if self._tracking is not None:
-            newest = None if track is None else track.detection
+            newest = context.objects.in_sight(self.subject)
             why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"approach lost the gimbal: {why}")
@@ -231,8 +231,6 @@ class ApproachBehaviour(Behaviour):
             if (target := context.objects.in_sight(self.subject)) is not None:
                 # Fully inside the image it may get a range.
                 self._bearing_rad = target.bearing_rad
-                if self._tracking is not None:
-                    self._tracking.turn_to(target, context)
             return
         if self._object is None:
             path_m = abs(seen.detection.ground_range_m - self._command.distance_m)

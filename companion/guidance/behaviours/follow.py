@@ -142,7 +142,7 @@ class FollowBehaviour(Behaviour):
             north, east = point[0] - position[0], point[1] - position[1]
             self._range_m = math.hypot(north, east)
         if self._tracking is not None:
-            newest = None if track is None else track.detection
+            newest = context.objects.in_sight(self.subject)
             why = self._tracking.keep_on(newest, self._range_m, position, context)
             if why is not None:
                 return Outcome(False, f"follow lost the gimbal: {why}")
@@ -204,8 +204,6 @@ class FollowBehaviour(Behaviour):
         elif (target := context.objects.in_sight(self.subject)) is not None:
             # Fully inside the image it may get a range.
             self._yaw_rad = target.bearing_rad
-            if self._tracking is not None:
-                self._tracking.turn_to(target, context)
 
     @property
     def gimbal_aim(self) -> GimbalAim | None:

@@ -142,25 +142,24 @@ class GimbalTracking:
             return None
         return context.gimbal.problem or None
 
-    def turn_to(self, target: Target, context: BehaviourContext) -> None:
-        """Point at a target without a range: fully inside the image it may get one."""
-        self._point_at(target.elevation_rad, context)
-
     def keep_on(
         self, newest: Target | None, range_m: float, position: Vector3, context: BehaviourContext
     ) -> str | None:
         """Point at the object's estimated position, within the gimbal's range.
 
         Args:
-            newest: its newest detection; None: none with a range.
-            range_m: its estimated range now, horizontal metres.
+            newest: its newest detection; None: none.
+            range_m: its estimated range now, horizontal metres; NaN: not known yet. Fully inside the image it
+                may get one.
             position: the vehicle's, local NED metres.
             context: for the gimbal's state.
 
         Returns:
             Why tracking has failed, in words; None: the gimbal follows.
         """
-        if newest is not None:
+        if newest is not None and math.isnan(range_m):
+            self._point_at(newest.elevation_rad, context)
+        elif newest is not None:
             range_m = max(range_m, NEAREST_M)
             if newest is not self._seen:
                 self._seen = newest

@@ -314,7 +314,7 @@ def test_aim_stays_within_the_end_stops(
     assert abs(pitch_rad) <= math.pi / 2
     if -math.pi / 2 <= low <= high <= math.pi / 2:
         assert low <= pitch_rad <= high
-    tracking.turn_to(seen, now)
+    tracking.keep_on(seen, math.nan, (0.0, 0.0, -10.0), now)
     assert tracking.aim is not None
 
 
