@@ -19,7 +19,7 @@ from companion.guidance.command_queue import CommandQueue
 from companion.guidance.interface import Answer, CommandInput, EventKind, GuidanceInput, OutputCollector
 from companion.guidance.limits.battery import ENDINGS, BatteryMinimum, BatteryMonitor
 from companion.guidance.mode_control import ModeControl, Phase
-from companion.guidance.motion import VelocityBias
+from companion.guidance.motion import Lasting, VelocityBias
 from companion.guidance.objects.closing_check import Approached
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.setpoint import Setpoint
@@ -82,7 +82,7 @@ class BehaviourRunner:
         self._answered = False
         self._after_battery = self._activated = False
         self._stepped_ns: int | None = None
-        self._position_lost_ns: int | None = None
+        self._position_lost = Lasting()
         self._velocity_bias = VelocityBias()
 
     def begin_command(self, behaviour: Behaviour, command: CommandInput, context: BehaviourContext) -> None:
@@ -187,7 +187,7 @@ class BehaviourRunner:
         self._answered = False
         if command is None:
             self._modes.decide_alone()
-        self._activated, self._position_lost_ns = False, None
+        self._activated, self._position_lost = False, Lasting()
         self._setpoints.blind = False
 
     def _run(self, behaviour: Behaviour, context: BehaviourContext, sent_count: int) -> None:
@@ -290,13 +290,12 @@ class BehaviourRunner:
     def _position_known(self, context: BehaviourContext) -> bool:
         """Check the position estimate; without it brake, and after `POSITION_LOSS_S` give up command."""
         fault = context.state.position_fault(context.now_ns)
+        lost_s = self._position_lost.held_s(fault is not None, context.now_ns)
         if fault is None:
-            self._position_lost_ns = None
             return True
-        if self._position_lost_ns is None:
+        if lost_s == 0.0:
             logger.warning("position or attitude lost (%s): braking", fault)
-            self._position_lost_ns = context.now_ns
-        if context.now_ns - self._position_lost_ns > POSITION_LOSS_S * 1e9:
+        if lost_s > POSITION_LOSS_S:
             why = f"position or attitude lost for {POSITION_LOSS_S:g} s ({fault})"
             self._lose(why, context.state)
         elif self._modes.phase is Phase.OFFBOARD:

@@ -7,6 +7,7 @@ from enum import StrEnum
 from companion.guidance.authority import Authority, stream_interruption
 from companion.guidance.behaviour import BehaviourContext, ModeRequest
 from companion.guidance.interface import Answer, Arm, Disarm, GuidanceInput, OutputCollector, SetMode, TakeOff
+from companion.guidance.motion import Lasting
 from companion.guidance.setpoint_output import SetpointOutput
 from companion.vehicle.setpoint_loss import setpoint_loss_outcome
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
@@ -229,7 +230,7 @@ class _ModeSequence:
 
     def __init__(self, request: ModeRequest, state: VehicleState) -> None:
         self._actions: list[SetMode | Arm | TakeOff] = []
-        self._waiting_since_ns: int | None = None
+        self._waiting = Lasting()
         arms = request.mode in (FlightMode.TAKEOFF, FlightMode.HOLD)
         if request.arm and arms and not state.armed:
             # After a landing PX4 may show the mode from before the landing, in which it does not arm.
@@ -255,9 +256,7 @@ class _ModeSequence:
         """
         if not self._actions:
             return None
-        if isinstance(self._actions[0], Arm) and not state.ready_to_arm:
-            if self._waiting_since_ns is None:
-                self._waiting_since_ns = now_ns
-            if now_ns - self._waiting_since_ns <= READY_TIMEOUT_S * 1e9:
-                return None
+        waits = isinstance(self._actions[0], Arm) and not state.ready_to_arm
+        if waits and self._waiting.held_s(True, now_ns) <= READY_TIMEOUT_S:
+            return None
         return self._actions.pop(0)

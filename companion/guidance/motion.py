@@ -277,23 +277,34 @@ class VelocityBias:
         return (north_mps + share * self._bias_mps[0], east_mps + share * self._bias_mps[1], down_mps)
 
 
+class Lasting:
+    """Measures for how long a condition has held without interruption."""
+
+    def __init__(self) -> None:
+        self._since_ns: int | None = None
+
+    def held_s(self, holds: bool, now_ns: int) -> float:
+        """Seconds for which it has held at every update; negative: it does not hold now."""
+        if not holds:
+            self._since_ns = None
+            return -1.0
+        if self._since_ns is None:
+            self._since_ns = now_ns
+        return (now_ns - self._since_ns) / 1e9
+
+
 class Arrival:
     """Arrival detector: near the goal, slow, and settled there."""
 
     def __init__(self) -> None:
-        self._since_ns: list[int | None] = [None] * len(SETTLED)
+        self._settled = [Lasting() for _ in SETTLED]
 
     def update(self, distance_m: float, speed_mps: float, now_ns: int, near_m: float = ARRIVED_M) -> bool:
         """True once arrived. Call it at every update. `near_m`: at most `ARRIVED_M`."""
         arrived = False
         for index, (tolerance_m, slow_mps, lasting_s) in enumerate(SETTLED):
-            since_ns = self._since_ns[index]
-            allowed_m = near_m if index == 0 else tolerance_m
-            if not (distance_m <= allowed_m and speed_mps <= slow_mps):
-                self._since_ns[index] = None
-            elif since_ns is None:
-                self._since_ns[index] = now_ns
-            elif now_ns - since_ns >= lasting_s * 1e9:
+            settles = distance_m <= (near_m if index == 0 else tolerance_m) and speed_mps <= slow_mps
+            if self._settled[index].held_s(settles, now_ns) >= lasting_s:
                 arrived |= distance_m <= near_m and speed_mps <= ARRIVED_MPS
         return arrived
 

@@ -30,7 +30,14 @@ from companion.guidance.formation.neighbours import Neighbour, Neighbourhood, an
 from companion.guidance.formation.pose import FormationNote, Plan, Structure
 from companion.guidance.formation.separation import MARGIN_M, avoid, repulsion
 from companion.guidance.formation.virtual_structure import VirtualStructure
-from companion.guidance.motion import Standing, add_velocity_error, home_of, position_and_yaw, stopping_speed
+from companion.guidance.motion import (
+    Lasting,
+    Standing,
+    add_velocity_error,
+    home_of,
+    position_and_yaw,
+    stopping_speed,
+)
 from companion.vehicle.setpoint import Setpoint
 from vision.attitude import wrap_angle
 
@@ -129,9 +136,8 @@ class FormationBehaviour(Behaviour):
         self._heading_rad: float | None = None
         self._turn_rate_radps = 0.0
         self._error_m = 0.0
-        self._lost_since_ns: int | None = None
+        self._lost, self._arrived = Lasting(), Lasting()
         self._standing: Standing | None = None
-        self._arrived_since_ns: int | None = None
         self._over_since_ns: int | None = None
         self._led: bool | None = None
         self._words = "waiting for the others"
@@ -158,7 +164,7 @@ class FormationBehaviour(Behaviour):
         if isinstance(leader, str):
             self._report_waiting(hood)
             return self._without_leader(dt_s, context, leader)
-        self._lost_since_ns = None
+        self._lost.held_s(False, context.now_ns)
         position, _ = position_and_yaw(context.state)
         if self._heading_rad is None:
             self._heading_rad = leader.heading_rad
@@ -293,11 +299,8 @@ class FormationBehaviour(Behaviour):
         now_ns = context.now_ns
         if agreement.by != own:
             return Outcome(True, OVER) if leader.over else None
-        if not (self._structure.arrived and agreement.worst_error_m < ARRIVED_M):
-            self._arrived_since_ns = None
-        elif self._arrived_since_ns is None:
-            self._arrived_since_ns = now_ns
-        elif self._over_since_ns is None and now_ns - self._arrived_since_ns > ARRIVED_S * 1e9:
+        arrived = self._structure.arrived and agreement.worst_error_m < ARRIVED_M
+        if self._arrived.held_s(arrived, now_ns) > ARRIVED_S and self._over_since_ns is None:
             self._over_since_ns = now_ns
         if self._over_since_ns is not None and now_ns - self._over_since_ns > PUBLISH_S * 1e9:
             return Outcome(True, OVER)
@@ -387,11 +390,7 @@ class FormationBehaviour(Behaviour):
 
     def _without_leader(self, dt_s: float, context: BehaviourContext, why: str | None) -> BehaviourOutput:
         """Brake and hold, at most for the time-out."""
-        now_ns = context.now_ns
-        if self._lost_since_ns is None:
-            self._lost_since_ns = now_ns
-        lost_s = (now_ns - self._lost_since_ns) / 1e9
-        if lost_s > (most_s := self._command.lost_timeout_s):
+        if self._lost.held_s(True, context.now_ns) > (most_s := self._command.lost_timeout_s):
             return Outcome(False, f"{why or 'the leader is lost'}; waited for {most_s:g} s")
         self._words = f"holding: {why}"
         return self._stand(dt_s, context)

@@ -20,7 +20,7 @@ from companion.guidance.command import (
     behaviour,
 )
 from companion.guidance.gimbal.pitch import LEAST_SWEEP_DEG, USUAL_RATE_DPS, GimbalSweep
-from companion.guidance.motion import Standing, in_degrees, laps_text, position_and_yaw
+from companion.guidance.motion import Lasting, Standing, in_degrees, laps_text, position_and_yaw
 from companion.guidance.objects.target import DOUBTED
 from companion.guidance.objects.tracked_object import FOUND_FRAMES, TrackedObject
 from companion.guidance.search_pattern import Footprint, expanding_square, field_of_view_rad, lawnmower
@@ -135,7 +135,7 @@ class Facing:
         self._begun_ns = now_ns
         self._pointed = found.unseen_s(now_ns) <= SIGHT_FRESH_S
         self._expected_ns = found.last_ns
-        self._facing_since_ns: int | None = None
+        self._facing = Lasting()
 
     @property
     def bearing_rad(self) -> float:
@@ -157,30 +157,19 @@ class Facing:
             self._expected_ns = now_ns
         expected_s = (now_ns - max(self.object.last_ns, self._expected_ns)) / 1e9
         self.lost = expected_s > SIGHT_LOST_S or now_ns - self._begun_ns > FACING_TIMEOUT_S * 1e9
-        if self.object.unseen_s(now_ns) > SIGHT_FRESH_S or off_rad > FACING_RAD:
-            self._facing_since_ns = None
-        elif self._facing_since_ns is None:
-            self._facing_since_ns = now_ns
-        since_ns = self._facing_since_ns
-        self.faced = (
-            since_ns is not None and now_ns - since_ns >= FACING_S * 1e9 and pitch_off_rad <= POINTED_RAD
-        )
+        facing = self.object.unseen_s(now_ns) <= SIGHT_FRESH_S and off_rad <= FACING_RAD
+        self.faced = self._facing.held_s(facing, now_ns) >= FACING_S and pitch_off_rad <= POINTED_RAD
 
 
 class BlindTime:
     """How long nothing was seen: a vehicle that stands meanwhile passes nothing unseen."""
 
     def __init__(self, limit_s: float) -> None:
-        self._limit_s = limit_s
-        self._since_ns: int | None = None
+        self._limit_s, self._blind = limit_s, Lasting()
 
     def outcome(self, context: BehaviourContext) -> Outcome | None:
         """The end of the behaviour, if perception has been stale for the limit."""
-        if context.perception_fresh:
-            self._since_ns = None
-        elif self._since_ns is None:
-            self._since_ns = context.now_ns
-        if self._since_ns is None or context.now_ns - self._since_ns <= self._limit_s * 1e9:
+        if self._blind.held_s(not context.perception_fresh, context.now_ns) <= self._limit_s:
             return None
         why = context.perception_fault("no detections received")
         return Outcome(False, f"{why} for {self._limit_s:g} s")

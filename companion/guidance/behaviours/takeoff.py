@@ -18,7 +18,14 @@ from companion.guidance.behaviour import (
     Requirement,
 )
 from companion.guidance.command import BuildContext, Command, Number, behaviour
-from companion.guidance.motion import ARRIVED_M, ARRIVED_MPS, POSITION_GAIN, PositionController, towards
+from companion.guidance.motion import (
+    ARRIVED_M,
+    ARRIVED_MPS,
+    POSITION_GAIN,
+    Lasting,
+    PositionController,
+    towards,
+)
 from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
@@ -58,8 +65,7 @@ class TakeoffBehaviour(Behaviour):
     def __init__(self, altitude_m: float = 2.5) -> None:
         self._altitude_m = altitude_m
         self._until_ns: float = 0
-        self._still_since_ns: int | None = None
-        self._there_since_ns: int | None = None
+        self._still, self._there = Lasting(), Lasting()
         self._top: Vector3 | None = None
         self._yaw_rad: float | None = None
         self._controller = PositionController()
@@ -84,7 +90,7 @@ class TakeoffBehaviour(Behaviour):
     def on_activate(self, context: BehaviourContext) -> None:
         limit_s = BASE_TIMEOUT_S + self._altitude_m / SLOWEST_CLIMB_MPS
         self._until_ns = context.now_ns + limit_s * 1e9
-        self._still_since_ns = self._there_since_ns = self._top = None
+        self._still, self._there, self._top = Lasting(), Lasting(), None
         self._controller = PositionController()
         acceptance_m = context.parameters.altitude_acceptance_m
         reach_m = (DEFAULT_ACCEPTANCE_M if acceptance_m is None else acceptance_m) + LOW_MARGIN_M
@@ -100,9 +106,8 @@ class TakeoffBehaviour(Behaviour):
         holding = airborne and state.mode in (FlightMode.HOLD, FlightMode.OFFBOARD)
         still = holding and abs((state.velocity_ned_mps or (0.0, 0.0, 0.0))[2]) <= ARRIVED_MPS
         there = still and abs(missing_m) <= ALTITUDE_TOLERANCE_M
-        self._still_since_ns = (self._still_since_ns or now_ns) if still else None
-        self._there_since_ns = (self._there_since_ns or now_ns) if there else None
-        if self._there_since_ns is not None and now_ns - self._there_since_ns >= THERE_S * 1e9:
+        still_s = self._still.held_s(still, now_ns)
+        if self._there.held_s(there, now_ns) >= THERE_S:
             return Outcome(
                 True,
                 f"took off, {self._altitude_now_m:.1f} m above home",
@@ -113,7 +118,6 @@ class TakeoffBehaviour(Behaviour):
                 False, f"take-off timed out: {self._altitude_now_m:.1f} m of {self._altitude_m:g} m reached"
             )
         if self._top is None:
-            still_s = 0.0 if self._still_since_ns is None else (now_ns - self._still_since_ns) / 1e9
             if self._low:
                 begins = state.armed and state.mode in (FlightMode.HOLD, FlightMode.OFFBOARD)
             else:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 from companion.guidance.behaviour import BehaviourContext
 from companion.guidance.command import EnumArgument
+from companion.guidance.motion import Lasting
 from companion.guidance.objects.target import Target
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
@@ -126,12 +127,13 @@ class GimbalTracking:
         self._begun_ns = 0
         self._seen: Target | None = None
         self._down_m: float | None = None
-        self._behind_since_ns: int | None = None
+        self._behind = Lasting()
 
     def begin(self, context: BehaviourContext) -> None:
         """Hold the current pitch, so that control is acquired before the object is seen."""
         gimbal = context.state.gimbal
-        self.aim = self._seen = self._down_m = self._behind_since_ns = None
+        self.aim = self._seen = self._down_m = None
+        self._behind = Lasting()
         self._begun_ns = context.now_ns
         if gimbal is not None and gimbal.pitch_rad is not None:
             self.aim = GimbalAim(gimbal.nearest_pitch_rad(gimbal.pitch_rad))
@@ -178,13 +180,11 @@ class GimbalTracking:
 
     def _stuck(self, context: BehaviourContext) -> str | None:
         """The gimbal lags behind its aim for longer than `PATIENCE_S`, in words; None: it does not."""
-        gimbal, now_ns = context.state.gimbal, context.now_ns
+        gimbal = context.state.gimbal
         measured_rad = None if gimbal is None else gimbal.pitch_rad
-        if self.aim is None or measured_rad is None or abs(self.aim.pitch_rad - measured_rad) <= BEHIND_RAD:
-            self._behind_since_ns = None
+        off_rad = 0.0 if self.aim is None or measured_rad is None else abs(self.aim.pitch_rad - measured_rad)
+        if self._behind.held_s(off_rad > BEHIND_RAD, context.now_ns) <= PATIENCE_S:
             return None
-        if self._behind_since_ns is None:
-            self._behind_since_ns = now_ns
-        if now_ns - self._behind_since_ns <= PATIENCE_S * 1e9:
-            return None
+        assert self.aim is not None
+        assert measured_rad is not None
         return f"it does not follow: {gap_text(self.aim.pitch_rad, measured_rad)}"

@@ -13,6 +13,7 @@ from typing import Literal
 from companion.guidance.behaviour import Behaviour, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
+from companion.guidance.motion import Lasting
 from companion.vehicle.state import VehicleState
 
 # BATTERY_STATUS comes every 2 s, SYS_STATUS more often: three of the slower one are missing.
@@ -90,24 +91,17 @@ class BatteryMonitor:
 
     def __init__(self, minimum: BatteryMinimum) -> None:
         self.minimum = minimum
-        self._low_since_ns: int | None = None
-        self._unknown = False
-        self._acted = False
+        self.reset()
 
     def reset(self) -> None:
         """Start over for a new command: everything is reported again."""
-        self._low_since_ns, self._unknown, self._acted = None, False, False
+        self._low, self._unknown, self._acted = Lasting(), False, False
 
     def ending(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
         """Why the active behaviour must end; reported once per command."""
         if self._acted or self.minimum.fraction == 0.0 or not needs_charge(behaviour):
             return None
-        if not self.minimum.below(state, now_ns):
-            self._low_since_ns = None
-            return None
-        if self._low_since_ns is None:
-            self._low_since_ns = now_ns
-        if now_ns - self._low_since_ns < LOW_FOR_S * 1e9:
+        if self._low.held_s(self.minimum.below(state, now_ns), now_ns) < LOW_FOR_S:
             return None
         self._acted = True
         return (
