@@ -219,7 +219,7 @@ class FormationBehaviour(Behaviour):
     ) -> _Leader | Outcome | str:
         assert hood.anchor is not None
         published = self._published_structures(hood)
-        mover = min((other.name for other in self._companions(hood) if not other.silent), default=hood.own)
+        mover = min((other.name for other, _ in self._companions(hood) if not other.silent), default=hood.own)
         if mover < hood.own:
             if mover not in published:
                 return f"no structure state from {mover} yet"
@@ -248,19 +248,16 @@ class FormationBehaviour(Behaviour):
             structure.move(dt_s, self._agreement.worst_error_m, off_rad)
         return _Leader(position, velocity, heading, 0.0, self._over_since_ns is not None)
 
-    def _companions(self, hood: Neighbourhood) -> list[Neighbour]:
-        """The known neighbours in this formation."""
-        return [
-            other
-            for other in hood.vehicles
-            if other.formation is not None and other.formation.leader == self.leader_name
-        ]
+    def _companions(self, hood: Neighbourhood) -> list[tuple[Neighbour, FormationNote]]:
+        """The known neighbours in this formation, and their parts in it."""
+        noted = ((other, other.formation) for other in hood.vehicles)
+        return [(other, note) for other, note in noted if note and note.leader == self.leader_name]
 
     def _published_structures(self, hood: Neighbourhood) -> dict[str, tuple[Neighbour, Structure]]:
         return {
-            other.name: (other, other.formation.structure)
-            for other in self._companions(hood)
-            if other.formation is not None and other.formation.structure is not None
+            other.name: (other, note.structure)
+            for other, note in self._companions(hood)
+            if note.structure is not None
         }
 
     def _centre_taken(self, hood: Neighbourhood) -> bool:

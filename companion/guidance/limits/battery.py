@@ -48,18 +48,14 @@ class BatteryMinimum:
 
     def missing(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
         """What is missing for a behaviour that needs charge, in words; None: nothing."""
-        if self.fraction == 0.0 or not needs_charge(behaviour):
-            return None
         charge = fresh_charge(state, now_ns)
-        needed = f"a battery above {self.fraction:.0%}"
-        if charge is not None and charge >= self.fraction:
+        if not self.applies_to(behaviour) or (charge is not None and charge >= self.fraction):
             return None
-        return f"{needed} ({_known(state, now_ns)}; guidance.min_battery_percent)"
+        return f"a battery above {self.fraction:.0%} ({_known(state, now_ns)}; guidance.min_battery_percent)"
 
-    def below(self, state: VehicleState, now_ns: int) -> bool:
-        """Whether a fresh value is below the minimum."""
-        charge = fresh_charge(state, now_ns)
-        return charge is not None and charge < self.fraction
+    def applies_to(self, behaviour: Behaviour) -> bool:
+        """Whether there is a minimum for this behaviour."""
+        return self.fraction > 0.0 and needs_charge(behaviour)
 
 
 NO_MINIMUM = BatteryMinimum()
@@ -99,9 +95,9 @@ class BatteryMonitor:
 
     def ending(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
         """Why the active behaviour must end; reported once per command."""
-        if self._acted or self.minimum.fraction == 0.0 or not needs_charge(behaviour):
-            return None
-        if self._low.held_s(self.minimum.below(state, now_ns), now_ns) < LOW_FOR_S:
+        charge = fresh_charge(state, now_ns)
+        low = self.minimum.applies_to(behaviour) and charge is not None and charge < self.minimum.fraction
+        if self._low.held_s(low, now_ns) < LOW_FOR_S or self._acted:
             return None
         self._acted = True
         return (
@@ -111,7 +107,7 @@ class BatteryMonitor:
 
     def unknown(self, behaviour: Behaviour, state: VehicleState, now_ns: int) -> str | None:
         """That the battery state is unknown or stale; reported once until it is fresh again."""
-        if self.minimum.fraction == 0.0 or not needs_charge(behaviour):
+        if not self.minimum.applies_to(behaviour):
             return None
         before, self._unknown = self._unknown, fresh_charge(state, now_ns) is None
         if before or not self._unknown:
