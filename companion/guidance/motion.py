@@ -226,12 +226,8 @@ class VelocityBias:
         self._stamp_ns = 0
         # Of the stamp: the predicted position, and the estimated velocity.
         self._predicted: tuple[tuple[float, float], Vector3] | None = None
+        # At most `MAX_BIAS_MPS`; 0 on the ground, and while position or velocity is unknown.
         self._bias_mps = (0.0, 0.0)
-
-    @property
-    def north_east_mps(self) -> tuple[float, float]:
-        """Local NED, at most `MAX_BIAS_MPS`; 0 on the ground, and while position or velocity is unknown."""
-        return self._bias_mps
 
     def update(self, state: VehicleState) -> None:
         """To be called in every step."""
