@@ -216,6 +216,9 @@ class PositionFilter:
         """
         target = fit.target
         self.motion = expected.update(fit)
+        partly = (target.cut and not self._cut) or self.is_part(target)
+        if partly and not self._stale(target.captured_ns):
+            return
         if target.position_ned_m is None:
             # Across the line of sight a bearing counts as much as a position.
             place = expected.state[:2] + fit.innovation
@@ -225,12 +228,10 @@ class PositionFilter:
                 place, covariance = self.motion.state[:2], self.motion.covariance[:2, :2]
             self._fuse(place, covariance)
             return
-        if (target.cut and not self._cut) or self.is_part(target):
-            if target.captured_ns - self.located_ns > STALE_S * 1e9:
-                # Where it was seen whole says nothing any more.
-                self.moving = self._moves(target, vehicle)
-                self._begin_fusion()
-                self._fuse(self.motion.state[:2], self.motion.covariance[:2, :2])
+        if partly:
+            self.moving = self._moves(target, vehicle)
+            self._begin_fusion()
+            self._fuse(self.motion.state[:2], self.motion.covariance[:2, :2])
             return
         place, covariance = np.array(target.position_ned_m[:2]), _covariance(target, vehicle)
         self.moving = self._moves(target, vehicle)
@@ -296,6 +297,14 @@ class PositionFilter:
     def begins_again(self, target: Target) -> bool:
         """Whether this is the first detection that the image's edge does not cut off."""
         return self._cut and not target.cut and target.position_ned_m is not None
+
+    def stands(self, now_ns: int) -> bool:
+        """Whether it stands where it was lately seen whole."""
+        return not self.moving and not self._stale(now_ns)
+
+    def _stale(self, now_ns: int) -> bool:
+        """Whether where it was last seen whole says nothing any more."""
+        return now_ns - self.located_ns > STALE_S * 1e9
 
     def is_part(self, target: Target) -> bool:
         """Whether the middle of this box is not the object's."""

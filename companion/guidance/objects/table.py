@@ -477,6 +477,11 @@ class _Frame:
         image tracker has not lost it, so the filter is wrong.
         """
         assert known.filter is not None
+        if target.cut and known.filter.stands(self._now_ns):
+            # Of the part within the image the middle is elsewhere: that is no manoeuvre.
+            known.filter.predict(self._now_ns)
+            self._own(known, target)
+            return
         part = known.filter.is_part(target) or self._partly_hidden(known, target)
         if target.position_ned_m is None or not target.trusted or part:
             known.refused = []

@@ -245,12 +245,18 @@ def test_object_that_is_cut_off_for_long_has_no_position() -> None:
     assert place_of(tracks)[0] == pytest.approx(98.0, abs=1.0)
 
 
-def test_object_that_leaves_the_image_keeps_its_position() -> None:
+@pytest.mark.parametrize("shown", ["with its range", "by its bearing alone", "with another part"])
+def test_object_that_leaves_the_image_keeps_its_position(shown: str) -> None:
+    """The middle of the part within the image moves along, or jumps."""
     tracks, vehicle = ObjectTable(), (0.0, 0.0, -5.0)
     for frame in range(40):
         leaving = max(frame - 20, 0)
-        target = replace(seen(vehicle, (12.0, 0.2 * leaving), frame, sigma_m=0.5), cut=leaving > 0)
+        east_m = 0.2 * leaving + (2.0 if shown == "with another part" and leaving > 10 else 0.0)
+        target = replace(seen(vehicle, (12.0, east_m), frame, sigma_m=0.5), cut=leaving > 0)
+        if shown == "by its bearing alone" and leaving > 0:
+            target = replace(target, position_ned_m=None, range_source=RangeSource.NONE)
         tracks.update([target], vehicle, target.captured_ns)
+        assert not position_of(tracks).occluded
     assert place_of(tracks)[:2] == pytest.approx((12.0, 0.0))
     assert not position_of(tracks).moving
 
