@@ -313,12 +313,13 @@ def cloud_attachment(
 
 def markers_message(
     result: PerceptionResult,
-    localized: LocalizedMarkers,
     vehicle: str,
     published_ns: int,
-    view: str | None = None,
+    view: str | None,
+    localized: LocalizedMarkers,
+    origin: GeodeticOrigin | None = None,
 ) -> MarkersBody:
-    """Create the message of one frame's markers."""
+    """Create the message of one frame's markers. `origin`: of local NED; None while it is unknown."""
     markers = result.markers or ()
     targets = localized.targets or (None,) * len(markers)
     return {
@@ -326,6 +327,7 @@ def markers_message(
         "localization_error": localized.error,
         "markers": [marker_body(marker, target) for marker, target in zip(markers, targets, strict=True)],
         "boards": [board_body(board) for board in localized.boards],
+        "objects": [_object(each, origin) for each in localized.objects],
     }
 
 

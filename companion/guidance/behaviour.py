@@ -117,6 +117,7 @@ class BehaviourContext:
         camera_fault: why nothing that the steering camera shows is used; empty: it is.
         parameters: of the autopilot.
         objects: what the steering camera shows and has shown, and which object a command means.
+        below: the same of the markers of cameras that look down.
 
     >>> from companion import BehaviourContext
     >>> from companion.vehicle.state import VehicleState
@@ -146,6 +147,7 @@ class BehaviourContext:
     camera_fault: str = ""
     parameters: AutopilotParameters = NOTHING_READ
     objects: ObjectsInView = field(default_factory=ObjectsInView)
+    below: ObjectsInView = field(default_factory=ObjectsInView)
 
     def perception_fault(self, default: str) -> str:
         """Why targets cannot be used, in words; `default` where neither gimbal nor camera is the reason."""

@@ -86,7 +86,9 @@ class Guidance:
         self._modes = ModeControl(self.setpoints, self._out)
         self._objects: tuple[TrackedObject, ...] = ()
         self._marker_objects: tuple[TrackedObject, ...] = ()
+        self._objects_below: tuple[TrackedObject, ...] = ()
         self._choices: dict[Subject, Choice] = {}
+        self._choices_below: dict[Subject, Choice] = {}
         self._has_gimbal = False
         self._queue = CommandQueue(self.gimbal)
         self.runner = BehaviourRunner(self.setpoints, self._modes, options.battery, self._queue, self._out)
@@ -210,7 +212,7 @@ class Guidance:
         """The computer or the process stood still: whatever was commanded before ends, also what waits."""
         self._queue.supersede(f"an event ({standstill.why})", self._out)
         self.runner.end_after_standstill(standstill.why)
-        self._objects = self._marker_objects = ()
+        self._objects = self._marker_objects = self._objects_below = ()
         if standstill.long or standstill.suspended:
             self._standstill = standstill
             self._refuse_until_ns = now_ns + round(standstill.late_commands_s * 1e9)
@@ -271,6 +273,9 @@ class Guidance:
             self._objects = inputs.objects
         if context.steering_markers.fresh:
             self._marker_objects = inputs.marker_objects
+        if context.markers.fresh:
+            shown = inputs.marker_objects if context.camera_fault else ()
+            self._objects_below = tuple(each for each in inputs.objects_below if each not in shown)
         fault = context.perception_fault("no detections received")
         in_view = ObjectsInView(
             self._objects,
@@ -283,7 +288,14 @@ class Guidance:
             self.options.track_max_age_s,
             self._choices,
         )
-        return replace(context, objects=in_view)
+        below = replace(
+            in_view,
+            objects=(),
+            markers=self._objects_below,
+            marker_fault=context.markers.fault,
+            _choices=self._choices_below,
+        )
+        return replace(context, objects=in_view, below=below)
 
     def _without_wrong_cameras(self, context: BehaviourContext) -> BehaviourContext:
         """The context without what a camera shows that does not fit the vehicle's motion (`ClosingCheck`)."""
@@ -350,6 +362,7 @@ class Guidance:
         self._closing.reset()
         self._closing_below.reset()
         self._choices.clear()
+        self._choices_below.clear()
         self.runner.begin_command(behaviour, command, context)
         if isinstance(behaviour, StopBehaviour):
             self.gimbal.end_goal(behaviour.name, self._out)

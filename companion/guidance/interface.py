@@ -214,6 +214,7 @@ class GuidanceInput:
         parameters: what was read from the autopilot when the link opened or returned.
         standstill: of the computer or the process, since the previous step; None: none.
         objects: of the steering camera, as of its newest frame. marker_objects: its markers in the same form.
+        objects_below: the markers of cameras that look down.
     """
 
     state: VehicleState
@@ -238,6 +239,7 @@ class GuidanceInput:
     camera_fault: str = ""
     objects: tuple[TrackedObject, ...] = ()
     marker_objects: tuple[TrackedObject, ...] = ()
+    objects_below: tuple[TrackedObject, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

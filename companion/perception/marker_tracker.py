@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import chain, combinations
 
-from companion.guidance.objects.from_detections import HistoryError, StateHistory, mount_at
+import numpy as np
+
+from companion.guidance.objects.from_detections import HistoryError, Pose, StateHistory, mount_at
 from companion.guidance.objects.from_markers import (
     CONFIRM_FRAMES,
     CONFIRM_GAP_S,
@@ -20,6 +22,7 @@ from companion.guidance.objects.from_markers import (
     board_targets,
     looks_down,
     marker_targets,
+    object_detections,
 )
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.tracked_object import TrackedObject
@@ -122,12 +125,31 @@ class MarkerTracker:
         # Of an id that is seen twice at most one is true.
         times = Counter(target.identifier for target in targets)
         once = tuple(target for target in targets if times[target.identifier] == 1)
-        self._seen[camera.name] = _SeenMarkers(result.captured_ns, once, down)
         if not error_text:
-            vehicle = history.at(result.captured_ns).position_ned_m
-            seen = [target.as_target() for target in once]
-            self._objects[camera.name].update(seen, vehicle, result.captured_ns)
-        return LocalizedMarkers(targets, boards, error_text, vision)
+            once = self._associate(camera.name, once, history.at(result.captured_ns), result.captured_ns)
+        self._seen[camera.name] = _SeenMarkers(result.captured_ns, once, down)
+        return LocalizedMarkers(targets, boards, error_text, vision, self.objects(camera))
+
+    def _associate(
+        self, camera: str | None, targets: tuple[MarkerTarget, ...], pose: Pose, captured_ns: int
+    ) -> tuple[MarkerTarget, ...]:
+        """Update the objects of a camera; returns the markers with the offset of their pad's object."""
+        table = self._objects[camera]
+        detections = []
+        for seen in object_detections(targets, pose.position_ned_m):
+            known = None if seen.track_id is None else table.of_track(seen.track_id)
+            # A frame without a marker that was confirmed is no reason to doubt it: the gate decides.
+            goes_on = known is not None and known.confirmed and known.unseen_s(captured_ns) <= CONFIRM_GAP_S
+            detections.append(replace(seen, trusted=seen.trusted or goes_on))
+        updated = table.update(detections, pose.position_ned_m, captured_ns)
+        places = {each.track_id: each.position_ned_m for each in updated if not each.occluded}
+        placed = []
+        for target in targets:
+            if (place := places.get(target.pad)) is not None:
+                north, east, down = pose.ned_from_body.T @ np.subtract(place, pose.position_ned_m)
+                target = replace(target, pad_offset_frd_m=(float(north), float(east), float(down)))
+            placed.append(target)
+        return tuple(placed)
 
     def _vision(
         self,
@@ -236,9 +258,14 @@ class MarkerTracker:
         self._runs.clear()
 
     def objects(self, camera: PerceptionCamera) -> tuple[TrackedObject, ...]:
-        """A camera's markers as objects, as of its newest frame."""
+        """A camera's markers as objects, as of its newest frame, one each."""
         table = self._objects.get(camera.name)
-        return () if table is None else table.objects
+        return () if table is None else _one_each(table.objects)
+
+    def objects_below(self) -> tuple[TrackedObject, ...]:
+        """The markers of the cameras that look down, one each."""
+        below = [self._objects[name].objects for name, seen in self._seen.items() if seen.looks_down]
+        return _one_each(chain.from_iterable(below))
 
     def steering_sight(self, camera: PerceptionCamera, now_ns: int, max_age_s: float) -> MarkerSight:
         """Return the markers of the steering camera, for behaviours that fly to one."""
@@ -293,6 +320,14 @@ def _cause(camera: PerceptionCamera, printed: str, checked: str, turned: bool) -
         "AprilRobotics' prints are turned by 180 degrees against OpenCV's: if these are "
         f'{other}\'s, set markers.print = "{other}"; else check {checked}'
     )
+
+
+def _one_each(objects: Iterable[TrackedObject]) -> tuple[TrackedObject, ...]:
+    """The newest confirmed object of each marker: after a gap, or of another camera, it is another one."""
+    best: dict[str, TrackedObject] = {}
+    for each in sorted(objects, key=lambda each: (each.confirmed, each.last_ns)):
+        best[each.class_name] = each
+    return tuple(best.values())
 
 
 def _continues(last: MarkerTarget, target: MarkerTarget) -> bool:

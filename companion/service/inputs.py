@@ -141,6 +141,7 @@ class InputAssembler:
             steering.frozen(now_ns),
             steering.objects.objects,
             () if markers is None else markers.objects(steering),
+            () if markers is None else markers.objects_below(),
         )
 
     def discard_received(self, now_ns: int) -> None:

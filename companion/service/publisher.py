@@ -96,6 +96,7 @@ class Publisher:
     ) -> None:
         bus, vehicle, name, now_ns = self._bus, self._vehicle, camera.name, time.monotonic_ns()
         state, steering = self._driver.state, camera is self._inputs.steering
+        of_frame = result, vehicle, now_ns, name
 
         def located() -> Localization:
             return replace(localization, origin=geodetic_origin(state, now_ns))
@@ -117,13 +118,11 @@ class Publisher:
         if result.track_events:
             bus.publish(
                 topics.TRACKS,
-                lambda: tracks_message(
-                    result, vehicle, now_ns, name, localization=located() if steering else None
-                ),
+                lambda: tracks_message(*of_frame, localization=located() if steering else None),
                 name,
             )
         if markers is not None:
-            bus.publish(topics.MARKERS, lambda: markers_message(result, markers, vehicle, now_ns, name), name)
+            bus.publish(topics.MARKERS, lambda: markers_message(*of_frame, markers, located().origin), name)
         if result.depth is not None:
             bus.publish(topics.DEPTH, lambda: depth_message(result, vehicle, now_ns, name), name)
         if (obstacles := result.obstacles) is not None and steering:

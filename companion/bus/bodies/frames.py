@@ -174,7 +174,7 @@ class DetectionsBody(FrameBody):
     detections: list[DetectionBody]
     """the detections"""
     objects: list[ObjectBody]
-    """of the frame, and the confirmed ones of the last 10 s; empty for another than the steering camera"""
+    """of the last 10 s, the confirmed ones of the last 60 s; empty for another than the steering camera"""
 
 
 class TrackEventBody(PositionBody):
@@ -300,6 +300,8 @@ class MarkersBody(FrameBody):
     """the markers"""
     boards: list[BoardBody]
     """the boards of `markers.boards_file`; empty where the vehicle's pose is unknown"""
+    objects: list[ObjectBody]
+    """markers, and the pads that they lie on: of the last 10 s, the confirmed ones of the last 60 s"""
 
 
 class DepthBoxBody(TypedDict):

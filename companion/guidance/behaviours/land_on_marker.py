@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from enum import StrEnum
 from typing import Annotated, ClassVar
 
@@ -25,14 +26,13 @@ from companion.guidance.behaviours.marker_search import MarkerSearch
 from companion.guidance.command import BuildContext, Command, EnumArgument, GrammarError, Number, behaviour
 from companion.guidance.motion import correction, position_and_yaw, towards
 from companion.guidance.objects.closing_check import Approached
-from companion.guidance.objects.from_markers import MarkerTarget
-from companion.guidance.objects.pad_filter import PadFilter
+from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, Vector3
 
-# A pad is found after this many detections, the newest at most this old.
-DETECTIONS_NEEDED, SIGHT_FRESH_S = 3, 0.6
+# A pad is found when it was seen at most this long ago.
+SIGHT_FRESH_S = 0.6
 # Unseen for the first time, the descent pauses; for the second, it is aborted.
 WAIT_AFTER_S, LOST_AFTER_S = 0.4, 2.2
 # From higher than this the pad's position is used for longer without detections.
@@ -131,17 +131,16 @@ class LandOnMarkerBehaviour(Behaviour):
         search_m: float = 5.0,
         speed_mps: float = 1.5,
     ) -> None:
-        self._identifier = identifier
+        self._identifier, self._marker = identifier, Subject(marker_id=identifier)
         self._by_autopilot, self._moving = by_autopilot, moving
         self._attempts, self._search_m, self._speed_mps = attempts, search_m, speed_mps
-        self._pad: PadFilter | None = None
+        self._pad: TrackedObject | None = None
         self._target: LandingTarget | None = None
-        self._marker: MarkerTarget | None = None
         self._phase = _Phase.SEARCH
         self._search: MarkerSearch | None = None
         self._started_down_m = self._goal_down_m = 0.0
         self._failures: list[str] = []
-        self._newest_ns = 0
+        self._begun_ns = 0
         self._blind_since_ns: int | None = None
         self._waiting_s = self._blocked_s = 0.0
         self._wanted_down_m = 0.0
@@ -155,14 +154,14 @@ class LandOnMarkerBehaviour(Behaviour):
         self._pad = self._target = self._blind_since_ns = None
         self._failures = []
         # Frames captured before the command are ignored: they may show another point.
-        self._newest_ns = context.now_ns
+        self._begun_ns = context.now_ns
         self._begin_search(context, position)
 
     def update(self, dt_s: float, context: BehaviourContext) -> BehaviourOutput:
         position, _ = position_and_yaw(context.state)
         self._observe(context)
         if self._pad is not None:
-            self._height_m = self._pad.at(context.now_ns)[2] - position[2]
+            self._height_m = self._pad.position_at(context.now_ns)[2] - position[2]
         state = context.state
         if self._phase in (_Phase.FINAL, _Phase.DELEGATED):
             if not state.armed and state.landed is LandedState.ON_GROUND:
@@ -175,7 +174,7 @@ class LandOnMarkerBehaviour(Behaviour):
 
     @property
     def approached(self) -> Approached | None:
-        return None if self._marker is None else Approached(self._marker.as_target(), moves=self._moving)
+        return None if self._pad is None else Approached(self._pad.detection, moves=self._moving)
 
     @property
     def landing_target(self) -> LandingTarget | None:
@@ -197,40 +196,27 @@ class LandOnMarkerBehaviour(Behaviour):
     def _observe(self, context: BehaviourContext) -> None:
         markers = context.markers
         self._blind_since_ns = (
-            None if markers.fresh else self._blind_since_ns or max(context.now_ns, self._newest_ns)
+            None if markers.fresh else self._blind_since_ns or max(context.now_ns, markers.captured_ns)
         )
-        detections = [
-            target
-            for target in markers.targets
-            if target.pad == self._identifier and target.captured_ns > self._newest_ns
-        ]
-        if not detections:
+        pad = context.below.of(self._marker)
+        seen_ns = self._begun_ns if self._pad is None else self._pad.last_ns
+        if pad is None or pad.position_ned_m is None or pad.last_ns <= seen_ns:
             return
-        self._newest_ns = max(target.captured_ns for target in detections)
-        for target in detections:
-            if self._pad is None:
-                self._pad = PadFilter(target, moving=self._moving)
-            elif not self._pad.add(target):
-                continue
-            self._marker = target
+        # Whether it moves is given: slow ones count as standing.
+        self._pad = replace(pad, moving=self._moving)
+        shown = [
+            each
+            for each in markers.targets
+            if (each.pad, each.captured_ns) == (self._identifier, pad.last_ns)
+        ]
+        if shown:
+            marker = min(shown, key=lambda each: each.range_sigma_m)
             self._target = LandingTarget(
-                target.captured_ns,
-                self._identifier,
-                self._pad.at(target.captured_ns),
-                target.pad_offset_frd_m,
-                target.size_m,
+                pad.last_ns, self._identifier, pad.position_ned_m, marker.pad_offset_frd_m, marker.size_m
             )
 
     def _unseen_s(self, now_ns: int) -> float:
         return math.inf if self._pad is None else self._pad.unseen_s(now_ns)
-
-    def _found(self, now_ns: int) -> PadFilter | None:
-        """The pad, if it was detected often enough and just now."""
-        pad = self._pad
-        return (
-            pad if pad is not None and pad.count >= DETECTIONS_NEEDED and pad.unseen_s(now_ns) < SIGHT_FRESH_S
-            else None
-        )  # fmt: skip
 
     # --- the phases
 
@@ -248,7 +234,7 @@ class LandOnMarkerBehaviour(Behaviour):
 
     def _searching(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns = context.now_ns
-        if self._found(now_ns) is not None:
+        if self._unseen_s(now_ns) < SIGHT_FRESH_S:
             if self._by_autopilot:
                 self._enter(_Phase.DELEGATED, now_ns, DELEGATED_TIMEOUT_S)
                 return ModeRequest(FlightMode.PRECISION_LAND)
@@ -277,7 +263,7 @@ class LandOnMarkerBehaviour(Behaviour):
         if unseen_s > (LOST_AFTER_S if self._height_m < LOW_M else LOST_HIGH_AFTER_S):
             why = f" ({context.markers.fault})" if context.markers.fault else ""
             return self._climb(f"lost {self._height_m:.1f} m above it{why}", context, position)
-        point, drift = pad.at(now_ns), pad.velocity_at(now_ns)
+        point, drift = pad.position_at(now_ns), pad.velocity_at(now_ns)
         error_m = math.dist(point[:2], position[:2])
         if self._height_m <= FINAL_M:
             self._waiting_s += dt_s
@@ -310,7 +296,7 @@ class LandOnMarkerBehaviour(Behaviour):
     def _finishing(self, dt_s: float, context: BehaviourContext, position: Vector3) -> BehaviourOutput:
         now_ns, pad = context.now_ns, self._pad
         assert pad is not None
-        point, drift = pad.at(now_ns), pad.velocity_at(now_ns)
+        point, drift = pad.position_at(now_ns), pad.velocity_at(now_ns)
         error_m = math.dist(point[:2], position[:2])
         seen = pad.unseen_s(now_ns) < WAIT_AFTER_S
         if seen and error_m > MISSED_M and self._height_m > MISSED_HEIGHT_M and not self._touching:
@@ -340,9 +326,10 @@ class LandOnMarkerBehaviour(Behaviour):
             if pad is not None and pad.unseen_s(now_ns) > LOST_AFTER_S:
                 # Discard the position: it may have been wrong.
                 self._pad = self._target = None
+                context.below.forget(self._marker)
             self._begin_search(context, position)
             return self._searching(dt_s, context, position)
-        point = position if pad is None else pad.at(now_ns)
+        point = position if pad is None else pad.position_at(now_ns)
         drift = (0.0, 0.0) if pad is None else pad.velocity_at(now_ns)
         if self._unseen_s(now_ns) > 2 * LOST_AFTER_S:
             point, drift = position, (0.0, 0.0)
@@ -355,7 +342,7 @@ class LandOnMarkerBehaviour(Behaviour):
 
     def _landed(self, context: BehaviourContext, position: Vector3) -> Outcome:
         assert self._pad is not None
-        beside_m = math.dist(self._pad.at(context.now_ns)[:2], position[:2])
+        beside_m = math.dist(self._pad.position_at(context.now_ns)[:2], position[:2])
         where = f"{beside_m:.2f} m beside where marker {self._identifier} was last seen"
         if self._by_autopilot and beside_m > ON_PAD_M:
             return Outcome(False, f"the autopilot landed elsewhere: {where}")

@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.guidance.objects.from_detections import Pose, StateHistory, mount_at
-from companion.guidance.objects.target import RangeSource, Target
+from companion.guidance.objects.range_error import HEADING_SIGMA_RAD
+from companion.guidance.objects.target import RangeSource, Target, marker_name
+from companion.guidance.objects.tracked_object import TrackedObject
 from companion.vehicle.state import Quaternion, Vector3
 from companion.vehicle.vision_position import VisionPosition
 from vision.camera_model import CameraModel, CameraMount
@@ -24,8 +26,8 @@ from vision.marker_boards import BoardPose
 from vision.markers import Marker, MarkerPose, PadMarker
 from vision.rotation import quaternion_from_matrix
 
-# One sigma of a marker's horizontal range, in addition to its own: mount and clocks, metres; and one degree
-# of the vehicle's attitude, times the difference in height.
+# One sigma of a marker's horizontal position, in addition to its own: mount and clocks, metres; and one
+# degree of the vehicle's attitude, times the difference in height.
 FIXED_SIGMA_M, TILT_SIGMA_RAD = 0.05, math.radians(1.0)
 # A marker is confirmed after so many processed frames in a row, with gaps of at most this.
 CONFIRM_FRAMES, CONFIRM_GAP_S = 3, 0.5
@@ -98,10 +100,12 @@ class MarkerTarget:
         bearing_rad: clockwise from north, -π..π. elevation_rad: above the horizon. Both from the vehicle.
         distance_m: straight from the vehicle. ground_range_m: over ground.
         position_ned_m: of its centre, local NED. pad_ned_m: of its pad's centre.
-        pad_offset_frd_m: from the vehicle to the pad's centre, in the body frame at the capture time.
+        pad_offset_frd_m: from the vehicle to the pad's centre, in the body frame at the capture time; of a
+            pad that is an object of this frame, to that object.
         heading_rad: direction of its upper edge, clockwise from north.
         size_m, side_px: side length, and the same in the image. reprojection_px: reprojection error.
-        range_sigma_m: one sigma of its horizontal range from the vehicle.
+        range_sigma_m: one sigma of its horizontal range from the vehicle. across_sigma_m: the same across the
+            line of sight, horizontal.
         resolved: which of the two poses of a square is the true one is known; else the one nearer to level is
             assumed, as pads are level.
         confirmed: detected in enough frames in a row, at one position, to be flown to.
@@ -124,6 +128,7 @@ class MarkerTarget:
     side_px: float
     reprojection_px: float
     range_sigma_m: float
+    across_sigma_m: float
     resolved: bool
     confirmed: bool = False
     located: tuple[MarkerPose, CameraMount, Pose] | None = field(
@@ -136,27 +141,46 @@ class MarkerTarget:
         assert self.located is not None
         return _body_pose(*self.located)
 
-    def as_target(self) -> Target:
-        """The target for behaviours that fly to an object; its surface is the marker's centre."""
+    def as_target(self, identifier: int, place: Vector3, vehicle: Vector3, *, trusted: bool) -> Target:
+        """The detection of an object at a place that this marker shows. `vehicle`: at the capture."""
+        north, east, down = (p - v for p, v in zip(place, vehicle, strict=True))
+        range_m = math.hypot(north, east)
         return Target(
-            marker_name(self.identifier),
+            marker_name(identifier),
             1.0,
             self.captured_ns,
-            self.bearing_rad,
-            self.elevation_rad,
-            ground_range_m=self.ground_range_m,
+            math.atan2(east, north),
+            math.atan2(-down, range_m),
+            ground_range_m=range_m,
             range_source=RangeSource.MARKER,
-            position_ned_m=self.position_ned_m,
-            track_id=self.identifier,
-            trusted=self.confirmed,
-            distance_m=self.distance_m,
+            position_ned_m=place,
+            track_id=identifier,
+            trusted=trusted,
+            distance_m=math.hypot(range_m, down),
             range_sigma_m=self.range_sigma_m,
+            across_sigma_m=self.across_sigma_m,
         )
 
 
-def marker_name(identifier: int) -> str:
-    """The class name of a marker's target."""
-    return f"marker {identifier}"
+def object_detections(targets: Sequence[MarkerTarget], vehicle: Vector3) -> list[Target]:
+    """The detections of objects that the markers of one frame are; a surface is a centre.
+
+    A marker that lies on the pad of another one is an object of its own, and shows that pad, whose object has
+    the id of the pad and is at its centre. Of several markers on a pad the most exact one says where it is.
+    """
+    shown: dict[int, list[MarkerTarget]] = {}
+    for target in targets:
+        shown.setdefault(target.pad, []).append(target)
+    seen = []
+    for pad, markers in shown.items():
+        best = min(markers, key=lambda each: each.range_sigma_m)
+        sure = any(each.confirmed for each in markers)
+        seen.append(best.as_target(pad, best.pad_ned_m, vehicle, trusted=sure))
+    for each in targets:
+        if each.identifier not in shown:
+            own = each.as_target(each.identifier, each.position_ned_m, vehicle, trusted=each.confirmed)
+            seen.append(own)
+    return seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +191,7 @@ class LocalizedMarkers:
         targets: one per marker, in their order; empty if `error` gives the reason.
         boards: the boards; empty too.
         vision: the vehicle's position from the map, for the autopilot; None: none, or not asked for.
+        objects: the camera's markers and pads, as guidance gets them.
         error: why they have no position; empty if they have.
     """
 
@@ -174,6 +199,7 @@ class LocalizedMarkers:
     boards: tuple[BoardTarget, ...] = ()
     error: str = ""
     vision: VisionPosition | None = None
+    objects: tuple[TrackedObject, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,6 +321,7 @@ def _target(
     ground_range_m = math.hypot(offset[0], offset[1])
     line = position / np.linalg.norm(position)
     own_sigma_m = math.sqrt(float(line @ fit.covariance[:3, :3] @ line))
+    common_sigma_m = math.hypot(FIXED_SIGMA_M, TILT_SIGMA_RAD * abs(float(offset[2])))
     return MarkerTarget(
         identifier=marker.identifier,
         pad=marker.identifier if on_pad is None else on_pad.pad,
@@ -310,7 +337,8 @@ def _target(
         size_m=marker.size_m,
         side_px=marker.side_px,
         reprojection_px=marker.reprojection_px,
-        range_sigma_m=math.hypot(FIXED_SIGMA_M, TILT_SIGMA_RAD * abs(float(offset[2])), own_sigma_m),
+        range_sigma_m=math.hypot(common_sigma_m, own_sigma_m),
+        across_sigma_m=math.hypot(common_sigma_m, HEADING_SIGMA_RAD * ground_range_m),
         resolved=resolved is not None,
         located=(fit, mount, pose),
     )

@@ -269,7 +269,9 @@ def _certain(seen: TrackedObject) -> bool:
 
 def _same(last: TrackedObject, objects: Sequence[TrackedObject]) -> TrackedObject:
     """The same object now; after two objects turned out to be one, that one."""
-    found = next((each for each in objects if each.object_id == last.object_id), None)
+    found = next(
+        (o for o in objects if (o.object_id, o.class_name) == (last.object_id, last.class_name)), None
+    )
     if found is None and last.track_id is not None:
         found = next((each for each in objects if last.track_id in each.track_ids), None)
     return last if found is None else found

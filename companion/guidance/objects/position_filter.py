@@ -29,12 +29,16 @@ from vision.geolocation import position_covariance
 RANDOM_WALK_M2_PER_S = 1.0
 # Spectral density of the acceleration, m²/s³: a walking person reverses in one or two seconds.
 ACCELERATION_M2_PER_S3 = 1.5
+# As the acceleration, of a marker's object: a landing pad drives straight on, or its position drifts with
+# the vehicle's estimate, in which it is. What turns at once is begun again (`ObjectTable`). And the wander of
+# that estimate: 0.1 m in 1 s, one sigma, far below the error of any other object.
+MARKER_ACCELERATION_M2_PER_S3, WANDER_M2_PER_S = 0.1, 0.01
 # One sigma of the unknown initial velocity.
 FIRST_VELOCITY_SIGMA_MPS = 2.0
 FASTEST_MPS = 15.0
 # Range errors from attitude, height and slope are correlated between frames, those of depth are not: relative
 # to the last frame the noise of a moving object is this fraction of a sigma, unless the source has changed.
-_CORRELATED = frozenset({RangeSource.GROUND_PLANE, RangeSource.KNOWN_HEIGHT, RangeSource.MARKER})
+_CORRELATED = frozenset({RangeSource.GROUND_PLANE, RangeSource.KNOWN_HEIGHT})
 FRAME_TO_FRAME = 0.35
 # That of depth is not less than this along the line of sight: the nearest point of a surface jumps.
 JITTER_M = 0.2
@@ -56,7 +60,9 @@ DISPLACED = ((1.5, 1.0), (3.0, 0.4))
 # from another side another point of its surface is seen, off by up to this share of the way across.
 COMMON_SIGMA, ACROSS_SHARE = 1.5, 0.4
 # Older detections count less, by this time constant: an object slower than `MOVING_MPS` may still move.
-MEMORY_S, MEMORY_OF_DEPTH_S = 5.0, 2.0
+MEMORY_S, MEMORY_OF_DEPTH_S, MEMORY_OF_MARKER_S = 5.0, 2.0, 0.3
+# Share of the difference by which a marker's detection changes the height of its object.
+HEIGHT_SHARE = 0.25
 # A detection this many sigma from the fused position shows that the object has moved.
 RESTART_SIGMA = 3.0
 # Not seen whole, with a range, for so long an object may be anywhere, although it is still detected.
@@ -132,7 +138,7 @@ class Estimate:
         """Predict to a time."""
         elapsed_s = max(0.0, (stamp_ns - self.captured_ns) / 1e9)
         move = transition(elapsed_s)
-        covariance = predicted_covariance(self.covariance, elapsed_s)
+        covariance = predicted_covariance(self.covariance, elapsed_s, self.source)
         return replace(self, state=move @ self.state, covariance=covariance, captured_ns=stamp_ns)
 
     def fit(self, target: Target, vehicle: Vector3) -> Fit:
@@ -199,9 +205,10 @@ class PositionFilter:
         self.motion = Estimate.initialize(target, vehicle)
         self.moving, self._cut = False, target.cut
         self._whole_height = 0.0
+        assert target.position_ned_m is not None
+        self._down_m = target.position_ned_m[2]
         self._was = deque([(target.captured_ns, self.motion.state, vehicle, _along(target, vehicle))])
         self._begin_fusion()
-        assert target.position_ned_m is not None
         self._fuse(np.array(target.position_ned_m[:2]), _covariance(target, vehicle) + spread)
         self._note_whole(target)
 
@@ -314,7 +321,8 @@ class PositionFilter:
         """Position in local NED, and (4, 4) covariance of north, east and their velocities."""
         # The filter's own covariance is from frame to frame: what all frames share is in the detections'.
         place, fused = self._fused
-        if self.moving:
+        if self.moving or self.motion.source is RangeSource.MARKER:
+            # A marker's position is so exact that the estimate's drift shows: it is followed.
             place = self.motion.state[:2]
         else:
             # How far the newest detections are from the fused position is part of its error.
@@ -337,8 +345,8 @@ class PositionFilter:
         self._information, self._weighted, self._count = np.zeros((2, 2)), np.zeros(2), 0.0
 
     def _forget(self, elapsed_s: float) -> None:
-        by_depth = self.motion.source in (RangeSource.DEPTH, RangeSource.MARKER)
-        kept = math.exp(-elapsed_s / (MEMORY_OF_DEPTH_S if by_depth else MEMORY_S))
+        memory_s = {RangeSource.DEPTH: MEMORY_OF_DEPTH_S, RangeSource.MARKER: MEMORY_OF_MARKER_S}
+        kept = math.exp(-elapsed_s / memory_s.get(self.motion.source, MEMORY_S))
         self._information, self._weighted = self._information * kept, self._weighted * kept
         self._count *= kept
 
@@ -353,7 +361,10 @@ class PositionFilter:
 
     def _note_whole(self, target: Target) -> None:
         assert target.position_ned_m is not None
-        self._down_m = target.position_ned_m[2]
+        down_m = target.position_ned_m[2]
+        if target.range_source is RangeSource.MARKER:
+            down_m = self._down_m + HEIGHT_SHARE * (down_m - self._down_m)
+        self._down_m = down_m
         self.located_ns, self._vehicle_sigma_m = target.captured_ns, target.vehicle_sigma_m
         if not target.cut_above:
             self._whole_height = _height(target)
@@ -417,11 +428,15 @@ def transition(elapsed_s: float) -> Vector:
     return move
 
 
-def predicted_covariance(covariance: Vector, elapsed_s: float) -> Vector:
-    """A (4, 4) covariance after this time, in which an unknown acceleration adds to it."""
-    move = transition(elapsed_s)
-    q = ACCELERATION_M2_PER_S3
+def predicted_covariance(covariance: Vector, elapsed_s: float, source: RangeSource) -> Vector:
+    """A (4, 4) covariance after this time, in which an unknown acceleration adds to it.
+
+    Where the range comes from a marker, the wander of the vehicle's own estimate adds to it, too.
+    """
+    move, by_marker = transition(elapsed_s), source is RangeSource.MARKER
+    q = MARKER_ACCELERATION_M2_PER_S3 if by_marker else ACCELERATION_M2_PER_S3
     position, mixed, velocity = q * elapsed_s**3 / 3.0, q * elapsed_s**2 / 2.0, q * elapsed_s
+    position += WANDER_M2_PER_S * elapsed_s if by_marker else 0.0
     noise = np.array(
         (
             (position, 0.0, mixed, 0.0),
@@ -447,6 +462,8 @@ def measurement_noise(target: Target, line_of_sight: Vector, share: float = 1.0)
     else:
         sigma_along = math.hypot(UNSTATED_SIGMA[0], UNSTATED_SIGMA[1] * range_m)
     sigma_across = math.hypot(ACROSS_SIGMA_M, BEARING_SIGMA_RAD * range_m)
+    if target.range_source is RangeSource.MARKER and math.isfinite(target.across_sigma_m):
+        sigma_across = target.across_sigma_m  # above is that of a box
     bearing_rad = math.atan2(line_of_sight[1], line_of_sight[0])
     least_m = JITTER_M if target.range_source is RangeSource.DEPTH else 0.0
     return position_covariance(bearing_rad, max(share * sigma_along, least_m), share * sigma_across)

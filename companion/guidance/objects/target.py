@@ -17,6 +17,11 @@ DOUBTED = "target not confirmed (score < tracker.confirm_score) or class ambiguo
 UNCONFIRMED_MARKER = "not confirmed: detected in too few frames in a row"
 
 
+def marker_name(identifier: int) -> str:
+    """The class name of a printed marker."""
+    return f"marker {identifier}"
+
+
 class RangeSource(StrEnum):
     """Source of a target's range."""
 

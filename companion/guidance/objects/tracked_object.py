@@ -6,13 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from companion.guidance.objects.from_markers import marker_name
 from companion.guidance.objects.position_filter import STALE_S, largest_sigma, predicted_covariance
-from companion.guidance.objects.target import DOUBTED, UNCONFIRMED_MARKER, RangeSource, Target
+from companion.guidance.objects.target import (
+    DOUBTED,
+    UNCONFIRMED_MARKER,
+    RangeSource,
+    Target,
+    marker_name,
+)
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.state import Vector3
 from vision.geolocation import ErrorEllipse
 
+# How long a drift of the vehicle's estimate, in which objects are located, lasts unseen.
+DRIFT_S = 0.6
 # An object that is ambiguous in this share of its frames is not chosen; found is one seen in so many frames.
 MOST_DOUBT, FOUND_FRAMES = 0.5, 3
 
@@ -98,19 +105,33 @@ class TrackedObject:
         return self.position_ned_m is not None and newest_ns - self.located_ns <= STALE_S * 1e9
 
     def position_at(self, now_ns: int) -> Vector3:
-        """Where it is expected: a moving object goes on. Raises ValueError without a position."""
+        """Where it is expected: a moving object goes on, and a marker for `DRIFT_S` with the estimate.
+
+        Raises ValueError without a position.
+        """
         if self.position_ned_m is None:
             raise ValueError(f"object {self.object_id}, a {self.class_name}, has no known range")
-        if not self.moving:
-            return self.position_ned_m
         north, east, down = self.position_ned_m
         north_mps, east_mps = self.velocity_ned_mps
         ahead_s = self.unseen_s(now_ns)
+        if not self.moving:
+            ahead_s = min(ahead_s, self._drift_s)
         return (north + ahead_s * north_mps, east + ahead_s * east_mps, down)
+
+    def velocity_at(self, now_ns: int) -> tuple[float, float]:
+        """Of `position_at`, north and east."""
+        goes_on = self.moving or self.unseen_s(now_ns) < self._drift_s
+        return self.velocity_ned_mps if goes_on else (0.0, 0.0)
+
+    @property
+    def _drift_s(self) -> float:
+        """How long a standing object goes on unseen: only of a marker is the velocity known well enough."""
+        return DRIFT_S if self.range_source is RangeSource.MARKER else 0.0
 
     def ellipse_at(self, now_ns: int) -> ErrorEllipse:
         """The horizontal error of `position_at`."""
-        covariance = predicted_covariance(np.array(self.covariance), self.unseen_s(now_ns))
+        unseen_s = self.unseen_s(now_ns)
+        covariance = predicted_covariance(np.array(self.covariance), unseen_s, self.range_source)
         return ErrorEllipse.of(covariance[:2, :2])
 
 

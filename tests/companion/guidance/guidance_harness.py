@@ -34,6 +34,7 @@ from companion.guidance.interface import (
 )
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.mode_control import Phase
+from companion.guidance.objects.from_markers import object_detections
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import Target
 from companion.service.requests import apply_output
@@ -302,7 +303,7 @@ class GuidanceHarness:
         self.streaming = True
         self.perception_age_s: float | None = 0.05
         self.results: dict[int, Outcome] = {}
-        self.table, self.marker_table = ObjectTable(), ObjectTable()
+        self.table, self.marker_table, self.table_below = ObjectTable(), ObjectTable(), ObjectTable()
         self._class_names, self._inputs = class_names, inputs
         self._identifiers = itertools.count(1)
 
@@ -361,11 +362,17 @@ class GuidanceHarness:
         if inputs.seen_ns is not None:
             captured_ns = inputs.targets[0].captured_ns if inputs.targets else inputs.seen_ns
             self.table.update(inputs.targets, self.vehicle.position_ned_m, captured_ns)
-        markers = inputs.steering_markers
-        seen = [marker.as_target() for marker in markers.targets]
-        if markers.captured_ns:
-            self.marker_table.update(seen, self.vehicle.position_ned_m, markers.captured_ns)
-        return replace(inputs, objects=self.table.objects, marker_objects=self.marker_table.objects)
+        pairs = ((self.marker_table, inputs.steering_markers), (self.table_below, inputs.markers))
+        for table, markers in pairs:
+            if markers.captured_ns:
+                seen = object_detections(markers.targets, self.vehicle.position_ned_m)
+                table.update(seen, self.vehicle.position_ned_m, markers.captured_ns)
+        return replace(
+            inputs,
+            objects=self.table.objects,
+            marker_objects=self.marker_table.objects,
+            objects_below=self.table_below.objects,
+        )
 
     def _state(self) -> VehicleState:
         """The vehicle's state, stamped by the companion's clock."""

@@ -21,7 +21,8 @@ from companion.guidance.behaviour import Outcome
 from companion.guidance.interface import GuidanceInput
 from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
+from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight, object_detections
+from companion.guidance.objects.table import ObjectTable
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
@@ -201,6 +202,8 @@ def test_a_frozen_camera_with_a_landing_gear_in_view_is_found(fault: str) -> Non
 def test_a_frozen_camera_leaves_the_markers_of_another(shared: bool) -> None:
     marker = pad_detection(0.0, 0.0)
     below = MarkerSight((marker,), fresh=True, missing="")
+    table, here = ObjectTable(), (0.0, 0.0, -3.0)
+    objects = table.update(object_detections([marker], here), here, marker.captured_ns)
     seen = Faults(missed=0.0, false_per_frame=0.0)
     detector = SyntheticDetector([person_at(12.0)], CAMERA, MOUNT, seed=1, faults=seen)
     camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector)
@@ -210,7 +213,13 @@ def test_a_frozen_camera_leaves_the_markers_of_another(shared: bool) -> None:
 
     def with_markers(*given: Any, **named: Any) -> GuidanceInput:
         steering = below if shared else NO_MARKERS
-        return replace(assemble(*given, **named), markers=below, steering_markers=steering)
+        return replace(
+            assemble(*given, **named),
+            markers=below,
+            steering_markers=steering,
+            marker_objects=objects if shared else (),
+            objects_below=objects,
+        )
 
     flight.inputs.assemble = with_markers  # type: ignore[method-assign]
     flight.fly(BEHAVIOURS["follow"], 2.0)
@@ -225,6 +234,7 @@ def test_a_frozen_camera_leaves_the_markers_of_another(shared: bool) -> None:
     assert not context.targets
     assert context.markers.fresh
     assert context.markers.targets == (() if shared else (marker,))
+    assert context.below.markers == (() if shared else objects)
 
 
 # --- markers: drawn, so that the images themselves are identical or not

@@ -1,8 +1,9 @@
-"""Marker targets in local NED for any attitude, and the pad filter."""
+"""Marker targets in local NED for any attitude, and the objects of pads."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,8 +12,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from companion.guidance.objects.from_detections import HistoryError, StateHistory
-from companion.guidance.objects.from_markers import MarkerSight, MarkerTarget, looks_down, marker_targets
-from companion.guidance.objects.pad_filter import DRIFT_S, PadFilter
+from companion.guidance.objects.from_markers import (
+    MarkerSight,
+    MarkerTarget,
+    looks_down,
+    marker_targets,
+    object_detections,
+)
+from companion.guidance.objects.table import ObjectTable
+from companion.guidance.objects.tracked_object import DRIFT_S, TrackedObject
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.guidance_harness import known
 from vision.attitude import quaternion_from_euler, wrap_angle
@@ -140,41 +148,114 @@ def test_missing_marker_detection_is_named() -> None:
     assert MarkerSight((), 1, 0.1, True, "").unavailable(1.5) is None
 
 
-def pad_detection(north: float, stamp_s: float, distance: float = 3.0) -> MarkerTarget:
-    target = seen((0.0, 0.0, -distance), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
-    position = (north, 0.0, 0.0)
-    from dataclasses import replace
+def pad_detection(
+    north: float, stamp_s: float, *, identifier: int = 7, right: float = 0.0, sigma: float = 0.05
+) -> MarkerTarget:
+    """A confirmed marker 3 m below, `right` of the centre of a pad that is `north` of home."""
+    target = seen((0.0, 0.0, -3.0), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0, identifier=identifier)
+    return replace(
+        target,
+        captured_ns=round(stamp_s * 1e9),
+        pad=7,
+        pad_ned_m=(north, 0.0, 0.0),
+        position_ned_m=(north, right, 0.0),
+        range_sigma_m=sigma,
+        confirmed=True,
+    )
 
-    return replace(target, captured_ns=round(stamp_s * 1e9), pad_ned_m=position, distance_m=distance)
+
+class Pad:
+    """The objects of markers that a vehicle sees from 3 m above home."""
+
+    def __init__(self) -> None:
+        self.table = ObjectTable()
+
+    def add(self, *markers: MarkerTarget, at_s: float | None = None) -> bool:
+        """Whether marker 7 is in this frame, and is taken."""
+        here = (0.0, 0.0, -3.0)
+        captured_ns = markers[0].captured_ns if at_s is None else round(at_s * 1e9)
+        self.table.update(object_detections(markers, here), here, captured_ns)
+        return self.of(7).last_ns == captured_ns
+
+    def of(self, identifier: int) -> TrackedObject:
+        return known(self.table.of_track(identifier))
 
 
-def test_single_outlier_is_rejected_and_many_restart() -> None:
-    pad = PadFilter(pad_detection(1.0, 1.0), moving=False)
+def test_single_outlier_is_rejected_and_agreeing_ones_not() -> None:
+    pad = Pad()
     for step in range(10):
         assert pad.add(pad_detection(1.0, 1.1 + step * 0.05))
     assert not pad.add(pad_detection(3.0, 1.7))
-    assert pad.at(2_000_000_000)[0] == pytest.approx(1.0, abs=0.01)
+    assert pad.of(7).position_at(2_000_000_000)[0] == pytest.approx(1.0, abs=0.01)
     believed = [pad.add(pad_detection(3.0, 1.75 + step * 0.05)) for step in range(8)]
-    assert believed[-1]
-    assert pad.at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
+    assert believed == [False, *[True] * 7]
+    assert pad.of(7).object_id == 1
+    assert pad.of(7).position_at(3_000_000_000)[0] == pytest.approx(3.0, abs=0.1)
 
 
-def test_moving_pad_is_predicted_and_a_static_one_for_a_moment() -> None:
-    rng = np.random.default_rng(4)
-    for moving in (True, False):
-        pad = PadFilter(pad_detection(0.0, 1.0), moving=moving)
-        for step in range(1, 80):
-            pad.add(pad_detection(0.5 * step * 0.05 + rng.normal(0.0, 0.03), 1.0 + step * 0.05))
-        last_s, unseen_s = 1.0 + 79 * 0.05, 2.0
-        assert pad.velocity_at(round(last_s * 1e9))[0] == pytest.approx(0.5, abs=0.12)
-        assert pad.at(round((last_s + 0.5) * 1e9))[0] == pytest.approx(0.5 * 4.45, abs=0.15)
-        later_ns = round((last_s + unseen_s) * 1e9)
-        ahead_s = unseen_s if moving else DRIFT_S
-        assert pad.at(later_ns)[0] == pytest.approx(0.5 * (3.95 + ahead_s), abs=0.3)
-        assert (pad.velocity_at(later_ns) != (0.0, 0.0)) is moving
+@pytest.mark.parametrize("off", [(0.5, 0.0), (0.0, 0.5)])
+def test_small_outlier_is_rejected_in_any_direction(off: tuple[float, float]) -> None:
+    """A box says less across the line of sight than a marker."""
+    pad = Pad()
+    for step in range(10):
+        pad.add(pad_detection(1.0, 1.0 + step * 0.05))
+    assert not pad.add(replace(pad_detection(1.0, 1.5), pad_ned_m=(1.0 + off[0], off[1], 0.0)))
 
 
-def test_old_detections_are_ignored() -> None:
-    pad = PadFilter(pad_detection(1.0, 1.0), moving=False)
-    assert not pad.add(pad_detection(5.0, 0.9))
-    assert pad.count == 1
+@pytest.mark.parametrize(("speed", "moving"), [(0.2, False), (1.5, True)])
+def test_pad_is_where_it_is_seen_and_goes_on_unseen(speed: float, moving: bool) -> None:
+    """A standing one drifts with the estimate, for a moment; of a moving one the estimate has no lag."""
+    rng, pad = np.random.default_rng(4), Pad()
+    for step in range(80):
+        pad.add(pad_detection(speed * step * 0.05 + rng.normal(0.0, 0.02), 1.0 + step * 0.05))
+    last_s, unseen_s = 1.0 + 79 * 0.05, 2.0
+    last_ns, later_ns = round(last_s * 1e9), round((last_s + unseen_s) * 1e9)
+    assert pad.of(7).moving is moving
+    assert pad.of(7).velocity_at(last_ns)[0] == pytest.approx(speed, abs=0.12)
+    assert pad.of(7).position_at(last_ns)[0] == pytest.approx(speed * 3.95, abs=0.03)
+    assert pad.of(7).position_at(last_ns + 500_000_000)[0] == pytest.approx(speed * 4.45, abs=0.1)
+    ahead_s = unseen_s if moving else DRIFT_S
+    assert pad.of(7).position_at(later_ns)[0] == pytest.approx(speed * (3.95 + ahead_s), abs=0.25)
+    assert (pad.of(7).velocity_at(later_ns) != (0.0, 0.0)) is moving
+
+
+def test_noise_of_the_range_hardly_changes_the_height() -> None:
+    pad, rng, heights = Pad(), np.random.default_rng(2), []
+    for step in range(80):
+        target = pad_detection(0.0, 1.0 + step * 0.05)
+        pad.add(replace(target, pad_ned_m=(0.0, 0.0, float(rng.normal(0.0, 0.2)))))
+        heights.append(known(pad.of(7).position_ned_m)[2])
+    assert float(np.std(heights[20:])) < 0.11
+
+
+def test_the_most_exact_marker_of_a_pad_says_where_it_is() -> None:
+    pad = Pad()
+    own, large = pad_detection(1.0, 1.0, sigma=0.2), pad_detection(1.4, 1.0, identifier=21, right=0.5)
+    pad.add(own, large)
+    assert pad.of(7).position_ned_m == (1.4, 0.0, 0.0)
+    assert pad.of(7).detection.range_sigma_m == 0.05
+    # The other one is an object of its own.
+    assert pad.of(21).position_ned_m == (1.4, 0.5, 0.0)
+    assert {each.class_name for each in pad.table.objects} == {"marker 7", "marker 21"}
+
+
+def test_pad_goes_on_while_only_a_part_of_it_is_seen() -> None:
+    pad = Pad()
+    for step in range(60):
+        at_s = 1.0 + step * 0.05
+        both = [pad_detection(1.0, at_s), pad_detection(1.0, at_s, identifier=21, right=0.5)]
+        assert pad.add(*(both, both[:1], both[1:])[step // 5 % 3])
+    assert pad.of(7).object_id == 1
+    assert pad.of(7).position_ned_m == pytest.approx((1.0, 0.0, 0.0), abs=1e-6)
+    # One that lies on no pad that is seen is its own pad.
+    alone = Pad()
+    alone.add(pad_detection(1.0, 1.0))
+    assert [each.class_name for each in alone.table.objects] == ["marker 7"]
+
+
+def test_sigma_of_a_position_is_stated_in_both_directions() -> None:
+    below = seen((0.0, 0.0, -3.0), 0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
+    [detection] = object_detections([below], (0.0, 0.0, -3.0))
+    covariance = known(detection.position_covariance)
+    # 5 cm of the mount and 1 degree of 3 m, the same all around below.
+    assert np.sqrt(np.diag(covariance)) == pytest.approx([0.073, 0.073], abs=0.005)

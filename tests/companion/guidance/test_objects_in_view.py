@@ -101,3 +101,18 @@ def test_object_without_a_range_gives_a_direction() -> None:
     target = known(view.in_sight(CAR))
     assert target.elevation_rad == unranged.elevation_rad
     assert scene.show(0.1, car(9.0)).of(CAR) is not None
+
+
+def test_marker_of_another_camera_is_the_same_marker() -> None:
+    """Each camera numbers its own objects."""
+    marker = Subject(marker_id=7)
+    first, other = (
+        ObjectTable().update([car(10.0 + off, 0.0, track_id, class_name=name)], HERE, 0)
+        for off, track_id, name in ((0.0, 7, "marker 7"), (2.0, 21, "marker 21"))
+    )
+    view = ObjectsInView(markers=first)
+    view.choose(marker, first[0])
+    [elsewhere] = ObjectTable().update([car(10.3, 0.0, 7, class_name="marker 7")], HERE, 0)
+    both = (*other, replace(elsewhere, object_id=2))
+    later = ObjectsInView(markers=both, _choices=view._choices)
+    assert known(later.of(marker)) is both[1]

@@ -9,14 +9,16 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from benchmarks import flights_land
 from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
 from companion.bus.session import encode as encode_message
-from companion.bus.topics import DETECTIONS, RUN, TRACKS, Topic
+from companion.bus.topics import DETECTIONS, MARKERS, RUN, TRACKS, Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.objects.in_view import ObjectsInView
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
@@ -28,6 +30,7 @@ from companion.recording.guidance_record import read_step
 from companion.recording.tap import run_record
 from companion.replay import replay
 from companion.service.publisher import Publisher, localization_of
+from companion.vehicle.landing_target import LandingTarget
 from tests.companion.bus.message_check import check_message
 from tests.companion.guidance.guidance_harness import in_the_air
 from tests.companion.recording.lockstep_recording import new_writer, recording
@@ -67,20 +70,22 @@ class Published:
 
     def publish(self, topic: Topic, body: Any, view: str | None = None) -> None:
         message = body() if callable(body) else body
-        if topic in (DETECTIONS, TRACKS):
+        if topic in (DETECTIONS, TRACKS, MARKERS):
             check_message(topic.name, message)
             self.messages.append((topic.name, encode_message(message)))
 
 
-def recorded_messages(published: Published, flight: LockstepFlight, folder: Path) -> list[tuple[str, Any]]:
-    """As they are read from a recording."""
+def recorded_messages(
+    published: Published, flight: LockstepFlight, folder: Path, *topics: Topic
+) -> list[tuple[str, Any]]:
+    """Those of some topics, as they are read from a recording."""
     writer, converter = new_writer(folder), Converter("vehicle1")
     run = run_record(flight.settings, flight.guidance.options, "service1")
     for name, payload in [(RUN.name, dumps(run)), *published.messages]:
         for message in converter.convert(name, payload, None):
             writer.write(*message)
     writer.close()
-    read = RecordingReader(writer.path).messages(DETECTIONS.name, TRACKS.name)
+    read = RecordingReader(writer.path).messages(*(topic.name for topic in topics))
     return [(message.channel.topic, json.loads(message.data)) for message in read]
 
 
@@ -127,7 +132,7 @@ def test_object_is_the_same_value_everywhere(
         flight.run(8.0)
 
     # Published and recorded.
-    read = recorded_messages(published, flight, tmp_path / "messages")
+    read = recorded_messages(published, flight, tmp_path / "messages", DETECTIONS, TRACKS)
     assert {topic for topic, _ in read} == {DETECTIONS.name, TRACKS.name}
     for topic, message in read:
         expected = {each.object_id: each for each in flown[message["captured_ns"]]}
@@ -157,4 +162,67 @@ def test_object_is_the_same_value_everywhere(
             kind = tuple[TrackedObject, ...]
             assert encode(kind, recorded.inputs.objects) == encode(kind, objects)  # NaN included
     assert len(steps) > 100
+    assert replay([path], {}).first is None
+
+
+def test_pad_is_the_same_value_everywhere(tmp_path: Path) -> None:
+    """In a message, in the recording, as it is flown to, and as the autopilot gets it."""
+    pad = flights_land.Pad((1.0, 0.5), 0.7)
+    finder = flights_land.ProjectedCamera(pad, flights_land.MOUNT, np.random.default_rng(3))
+    settings = camera_settings(flights_land.CAMERA, flights_land.MOUNT, flights_land.MARKER_SETTINGS)
+    camera = SyntheticCamera(settings, find_markers=finder.look, rate_hz=20.0)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=6.0), camera=camera)
+    published, step = Published(flight), flight.guidance.step
+    flown: dict[int, TrackedObject] = {}
+    targets: list[LandingTarget] = []
+
+    def watching(now_ns: int, inputs: GuidanceInput) -> GuidanceOutput:
+        output = step(now_ns, inputs)
+        context = flight.guidance.context
+        assert context is not None
+        chosen = context.below.of(Subject(marker_id=flights_land.MIDDLE))
+        if chosen is not None:
+            assert any(chosen is each for each in context.below.markers)
+            flown.setdefault(chosen.last_ns, chosen)
+        if (target := output.landing_target) is not None:
+            targets.append(target)
+            # ArduPilot gets it in the body's frame at the capture.
+            pose = flight.inputs.history.at(target.captured_ns)
+            place = pose.ned_from_body @ target.offset_frd_m + pose.position_ned_m
+            assert tuple(place) == pytest.approx(target.position_ned_m, abs=1e-9)
+        return output
+
+    flight.guidance.step = watching  # type: ignore[method-assign]
+    sent: list[Any] = []
+    send = flight.vehicle.send
+
+    def sending(message: Any) -> None:
+        sent.append(message)
+        send(message)
+
+    flight.vehicle.send = sending  # type: ignore[method-assign, assignment]
+    with recording(flight, tmp_path / "steps") as path:
+        flight.run(1.0)
+        flight.command(f"land-on-marker {flights_land.MIDDLE} method=autopilot")
+        flight.run(5.0)
+
+    read = [message for _, message in recorded_messages(published, flight, tmp_path / "messages", MARKERS)]
+    messages = {message["captured_ns"]: message for message in read}
+    on_wire = {each.time_usec: each for each in sent if each.get_type() == "LANDING_TARGET"}
+    assert len(targets) > 50
+    assert len(on_wire) == len(targets)
+    for target in targets:
+        chosen = flown[target.captured_ns]
+        [body] = [
+            each
+            for each in messages[target.captured_ns]["objects"]
+            if each["class_name"] == f"marker {flights_land.MIDDLE}"
+        ]
+        values = as_published(chosen)
+        assert {key: body[key] for key in values} == values
+        assert target.position_ned_m == chosen.position_ned_m
+        assert target.identifier == chosen.track_id
+        message = on_wire[target.captured_ns // 1000]
+        assert (message.x, message.y, message.z) == chosen.position_ned_m
+        assert message.target_num == chosen.track_id
     assert replay([path], {}).first is None

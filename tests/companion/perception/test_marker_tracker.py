@@ -138,6 +138,49 @@ def test_marker_seen_twice_in_a_frame_is_refused(flight: Flight) -> None:
     assert [target.identifier for target in flight.tracker.sight(flight.now_ns, 0.5).targets] == [5]
 
 
+def test_missed_frames_do_not_put_an_object_in_doubt(flight: Flight) -> None:
+    for step in range(30):
+        flight.frame([] if step > 3 and step % 2 else [(5, (0.3, 0.2))], later_s=0.05)
+    [marker] = flight.tracker.objects(flight.camera)
+    assert marker.certain
+    assert marker.doubt == 0.0
+    # Elsewhere, it is not taken.
+    flight.frame([(5, (-1.0, -0.2))], later_s=0.05)
+    [same] = flight.tracker.objects(flight.camera)
+    assert same.occluded
+    assert same.position_ned_m == marker.position_ned_m
+
+
+def test_marker_elsewhere_after_a_gap_is_it_when_confirmed(flight: Flight) -> None:
+    """A single false detection is not."""
+    for _ in range(10):
+        flight.frame([(5, (0.3, 0.0))], later_s=0.05)
+    for later_s in (0.7, 0.05):
+        flight.frame([(5, (-1.8, 1.0))], later_s=later_s)
+        for below in (flight.tracker.objects_below(), flight.tracker.objects(flight.camera)):
+            assert [each.position_ned_m for each in below] == [pytest.approx((0.3, 0.0, 0.0), abs=0.02)]
+    flight.frame([(5, (-1.8, 1.0))], later_s=0.05)
+    [moved] = flight.tracker.objects_below()
+    assert moved.position_ned_m == pytest.approx((-1.8, 1.0, 0.0), abs=0.02)
+
+
+def test_of_two_cameras_below_the_newest_object_is_used(tmp_path: Path) -> None:
+    flight, other = Flight(tmp_path), PerceptionCamera(Flight(tmp_path).camera.settings, "other")
+    forward = PerceptionCamera(Flight(tmp_path, 0.0).camera.settings, "forward")
+    first = flight.camera
+    flight.tracker = MarkerTracker([first, other, forward], lambda *event: None)
+    flight.frame([(5, (0.3, 0.2)), (6, (0.0, 0.0))])
+    flight.camera = other
+    flight.frame([(6, (0.4, 0.0))])
+    flight.camera = forward
+    flight.frame([(9, (6.0, 0.0))])
+    assert flight.tracker.objects(forward)
+    below = {each.class_name: each for each in flight.tracker.objects_below()}
+    assert set(below) == {"marker 5", "marker 6"}
+    assert below["marker 5"] in flight.tracker.objects(first)
+    assert below["marker 6"] in flight.tracker.objects(other)
+
+
 @pytest.mark.parametrize("frozen", ["forward", "down"])
 def test_fault_below_is_that_of_a_camera_that_looks_down(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, frozen: str
