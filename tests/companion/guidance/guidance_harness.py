@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
+from types import MappingProxyType
 from typing import Any, TypeVar
 
-from companion.bench.lockstep_flight import vehicle_in_the_air
+from companion.bench.lockstep_flight import LockstepFlight, vehicle_in_the_air
 from companion.clock import StandstillWatch
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
-from companion.guidance.behaviours.hold import HoldBehaviour
+from companion.guidance.command import NO_CONTEXT
 from companion.guidance.core import Guidance, GuidanceOptions
+from companion.guidance.grammar import parse
 from companion.guidance.interface import (
     Action,
     Answer,
@@ -33,6 +35,8 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.guidance.limits.envelope import Limits
+from companion.guidance.missions.mission_file import plan_from
+from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
 from companion.guidance.objects.from_markers import object_detections
 from companion.guidance.objects.table import ObjectTable
@@ -45,7 +49,7 @@ from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from companion.vehicle.streamer import Streamer
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
-from vision.attitude import quaternion_from_euler
+from vision.attitude import quaternion_from_euler, wrap_angle
 from vision.obstacle_sectors import ObstacleSectors
 from vision.path_planner import PathRequest
 
@@ -386,13 +390,20 @@ class GuidanceHarness:
         )
 
     def command(
-        self, behaviour: Behaviour | None = None, *, aim: GimbalAim | None = None, endless: bool = False
+        self, command: Behaviour | str | None = None, *, aim: GimbalAim | None = None, endless: bool = False
     ) -> Pending:
-        """Give a command and step guidance once."""
+        """Give a command, as an operator writes it or as its behaviour, and step guidance once."""
         identifier = next(self._identifiers)
+        behaviour = None if command is None else built(command)
         text = "gimbal" if behaviour is None else behaviour.name
         self.step(CommandInput(identifier, text, behaviour, aim, endless))
         return Pending(self.results, identifier)
+
+    def silent(self, seconds: float) -> bool:
+        """Advance time. True: no setpoint was sent."""
+        before = len(self.autopilot.setpoints)
+        self.run(seconds)
+        return len(self.autopilot.setpoints) == before
 
     def close(self) -> None:
         """The service ends."""
@@ -412,6 +423,11 @@ class GuidanceHarness:
         return pending.result()
 
 
+def built(command: Behaviour | str) -> Behaviour:
+    """The behaviour of a command that is written as an operator does."""
+    return parse(command).build(NO_CONTEXT) if isinstance(command, str) else command
+
+
 def assert_succeeded(outcome: BehaviourOutput | None, *words: str) -> Outcome:
     """Assert a success whose reason contains all words."""
     assert isinstance(outcome, Outcome)
@@ -426,6 +442,11 @@ def assert_failed(outcome: BehaviourOutput | None, *words: str) -> Outcome:
     assert not outcome.success, outcome.reason
     assert [word for word in words if word not in outcome.reason] == [], outcome.reason
     return outcome
+
+
+def with_state(**changes: Any) -> Callable[[GuidanceInput], GuidanceInput]:
+    """Inputs with another state."""
+    return lambda inputs: replace(inputs, state=replace(inputs.state, **changes))
 
 
 def known(value: T | None) -> T:
@@ -444,10 +465,36 @@ def parked(mode: FlightMode = FlightMode.HOLD) -> KinematicVehicle:
     return KinematicVehicle(position=[0.0, 0.0, 0.0], mode=mode, armed=False, landed=LandedState.ON_GROUND)
 
 
-def engaged(harness: GuidanceHarness, behaviour: Behaviour | None = None) -> Pending:
-    """Flying a behaviour in OFFBOARD."""
+def mission(
+    flight: GuidanceHarness | LockstepFlight,
+    *steps: str | Mapping[str, Any],
+    each: Mapping[str, Any] = MappingProxyType({}),
+    **top: Any,
+) -> SequenceBehaviour:
+    """A mission of commands, or of whole tables of steps. each: in every step. top: before the steps."""
+    tables = [dict(each) | ({"do": step} if isinstance(step, str) else dict(step)) for step in steps]
+    rows = [f"{key} = {value!r}" for key, value in top.items()]
+    for table in tables:
+        rows += ["[[step]]", *(f"{key} = {value!r}" for key, value in table.items())]
+    return SequenceBehaviour(plan_from("\n".join(rows), "test.toml"), flight.guidance.check_requirements)
+
+
+def hovering(vehicle: KinematicVehicle | None = None, **options: Any) -> GuidanceHarness:
+    """A harness whose first states were received; by default in the air."""
+    harness = GuidanceHarness(vehicle or flying(), **options)
+    harness.run(0.1 + harness.autopilot.lag_s)
+    return harness
+
+
+def standing(**options: Any) -> GuidanceHarness:
+    """The same on the ground, disarmed."""
+    return hovering(parked(), **options)
+
+
+def engaged(harness: GuidanceHarness, command: Behaviour | str = "hold") -> Pending:
+    """Flying a command in OFFBOARD."""
     harness.run(0.1)
-    pending = harness.command(behaviour or HoldBehaviour())
+    pending = harness.command(command)
     harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
     harness.run(0.5)
     return pending
@@ -460,17 +507,19 @@ def kinds(harness: GuidanceHarness) -> list[EventKind]:
 
 @dataclass
 class Flight:
-    """A behaviour flown through guidance, with a 10 Hz camera of 0.1 s latency.
+    """A command flown through guidance, with a 10 Hz camera of 0.1 s latency.
 
     Attributes:
+        command: as an operator writes it, or its behaviour.
+        seconds: of its last step.
         steps: outputs of the behaviour in OFFBOARD, the last one its outcome.
         track: positions of the vehicle.
         notes: the behaviour's, and those of its objects.
     """
 
-    behaviour: Behaviour
+    command: Behaviour | str
     vehicle: KinematicVehicle = field(default_factory=KinematicVehicle)
-    objects: list[SeenObject] = field(default_factory=list)
+    objects: Sequence[SeenObject] = ()
     perception_alive: bool = True
     noise: Callable[[], float] = lambda: 0.0
     limits: Limits = field(default_factory=Limits)
@@ -479,6 +528,20 @@ class Flight:
     steps: list[BehaviourOutput] = field(default_factory=list)
     track: list[tuple[float, float, float]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.behaviour = built(self.command)
+
+    def distance_m(self, number: int = 0) -> float:
+        """Over ground, from the vehicle to an object's surface now."""
+        seen = self.objects[number]
+        return math.dist(self.vehicle.position[:2], (seen.north, seen.east)) - seen.radius_m
+
+    def off_nose_rad(self, number: int = 0) -> float:
+        """Between the nose and the direction to an object now."""
+        seen, (north, east, _) = self.objects[number], self.vehicle.position
+        return abs(wrap_angle(math.atan2(seen.east - east, seen.north - north) - self.vehicle.yaw_rad))
 
     def run(
         self, seconds: float, each: Callable[[float, KinematicVehicle], None] = lambda t, v: None
@@ -498,7 +561,10 @@ class Flight:
         start_ns = self.vehicle.now_ns
         while self.vehicle.now_ns - start_ns < seconds * 1e9:
             now_ns = self.vehicle.now_ns
-            each((now_ns - start_ns) / 1e9, self.vehicle)
+            self.seconds = (now_ns - start_ns) / 1e9
+            each(self.seconds, self.vehicle)
+            for scene_object in self.objects:
+                scene_object.change(self.seconds)
             if now_ns >= next_frame_ns and self.perception_alive:
                 pending.append((now_ns, look(self.vehicle, self.objects, now_ns, noise=self.noise)))
                 next_frame_ns += round(1e9 / self.camera_hz)
@@ -512,6 +578,18 @@ class Flight:
             if command.done():
                 return command.result()
         return None
+
+
+def flown(
+    command: Behaviour | str,
+    *objects: SeenObject,
+    seconds: float = 90.0,
+    each: Callable[[float, KinematicVehicle], None] = lambda t, v: None,
+    **options: Any,
+) -> tuple[Flight, Outcome | None]:
+    """A flight with copies of the objects, and its outcome; None: it flies on."""
+    flight = Flight(command, objects=[replace(seen) for seen in objects], **options)
+    return flight, flight.run(seconds, each)
 
 
 class _Recording(Behaviour):
@@ -531,6 +609,9 @@ class _Recording(Behaviour):
 
     def on_deactivate(self) -> None:
         self._inner.on_deactivate()
+
+    def take_notes(self) -> Sequence[str]:
+        return self._inner.take_notes()
 
     @property
     def active(self) -> Behaviour:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.setpoint import Setpoint
@@ -79,7 +80,11 @@ class KinematicVehicle:
 
 @dataclass
 class SeenObject:
-    """An object on the ground and how the camera sees it."""
+    """An object on the ground and how the camera sees it.
+
+    Attributes:
+        then: seconds of the flight → what of it changes.
+    """
 
     class_name: str
     north: float
@@ -92,6 +97,11 @@ class SeenObject:
     track_id: int | None = None
     track_score: float | None = None
     trusted: bool = True
+    then: Callable[[float], Mapping[str, Any]] = lambda seconds: {}
+
+    def change(self, seconds: float) -> None:
+        for name, value in self.then(seconds).items():
+            setattr(self, name, value)
 
 
 def look(
