@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from companion.guidance import Approach, Follow
-from companion.guidance.behaviours.approach import ApproachBehaviour
-from companion.guidance.behaviours.follow import FollowBehaviour
+from companion.guidance import Follow
 from companion.guidance.behaviours.gimbal_pointing import PointGimbalBehaviour
-from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
-from companion.guidance.core import GuidanceOptions
 from companion.guidance.grammar import json_schema, markdown, usage
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.objects.ranging import RangeMeans
@@ -22,31 +17,36 @@ from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.gimbal import GimbalAim, YawFrame
 from tests.companion.guidance.gimbal_flight import gimbal_flight, person
 from tests.companion.guidance.guidance_harness import (
-    Flight,
     GuidanceHarness,
     assert_failed,
     assert_succeeded,
     engaged,
+    flown,
     flying,
     known,
 )
-from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
-
-NAMES = ("car", "person")
+from tests.companion.guidance.kinematic_vehicle import SeenObject, look
 
 
 def car(north: float, east: float, track_id: int, **more: Any) -> SeenObject:
     return SeenObject("car", north, east, track_id=track_id, track_score=0.8, **more)
 
 
-def watching(vehicle: KinematicVehicle, objects: Sequence[SeenObject], **more: Any) -> GuidanceHarness:
-    """Guidance that sees the objects in every step."""
+def walker(north: float, east: float, track_id: int, **more: Any) -> SeenObject:
+    return replace(car(north, east, track_id, **more), class_name="person")
+
+
+def watching(*objects: SeenObject, **more: Any) -> GuidanceHarness:
+    """Guidance that sees the objects in every step, for half a second until now."""
+    vehicle = flying()
 
     def seen(inputs: GuidanceInput) -> GuidanceInput:
         now_ns = vehicle.now_ns
         return replace(inputs, targets=look(vehicle, objects, now_ns), seen_ns=now_ns, **more)
 
-    return GuidanceHarness(vehicle, class_names=NAMES, options=GuidanceOptions(), inputs=seen)
+    harness = GuidanceHarness(vehicle, class_names=("car", "person"), inputs=seen)
+    harness.run(0.5)
+    return harness
 
 
 # --- the grammar
@@ -68,17 +68,15 @@ def test_help_and_schema_show_the_choice() -> None:
 # --- requirements
 
 
-def refused(harness: GuidanceHarness, behaviour: FollowBehaviour | OrbitBehaviour) -> str:
-    outcome = assert_failed(harness.command(behaviour).result())
+def refused(harness: GuidanceHarness, command: str) -> str:
+    outcome = assert_failed(harness.command(command).result())
     assert not harness.guidance.busy
     return outcome.reason
 
 
 def test_unknown_track_is_refused_with_what_is_there() -> None:
-    objects = [car(12, 0, 3), car(15, 2, 4), SeenObject("person", 10, -2, track_id=5, track_score=0.8)]
-    harness = watching(flying(), objects)
-    harness.run(0.5)
-    reason = refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
+    harness = watching(car(12, 0, 3), car(15, 2, 4), walker(10, -2, 5))
+    reason = refused(harness, "follow track=17")
     assert "no track 17" in reason
     assert "2 car, 1 person" in reason
     assert harness.events[-1].kind is EventKind.REFUSED
@@ -86,12 +84,10 @@ def test_unknown_track_is_refused_with_what_is_there() -> None:
 
 def test_ended_track_is_refused_with_the_nearest_of_its_class() -> None:
     first, near, far = car(12, 0, 17), car(12, 1.2, 23), car(20, 6, 20)
-    walker = SeenObject("person", 12.1, 0.1, track_id=21, track_score=0.8)
-    harness = watching(flying(), [first, near, far, walker])
-    harness.run(0.5)
+    harness = watching(first, near, far, walker(12.1, 0.1, 21))
     first.visible = False
     harness.run(14.0)
-    reason = refused(harness, OrbitBehaviour(Orbit(subject=Subject(track_id=17))))
+    reason = refused(harness, "orbit track=17")
     assert "track 17 ended 12 s ago" in reason
     assert "nearest car" in reason
     assert "track 23, 1.2 m from" in reason
@@ -99,34 +95,30 @@ def test_ended_track_is_refused_with_the_nearest_of_its_class() -> None:
 
 
 def test_ended_track_without_a_successor_is_refused_with_a_list() -> None:
-    harness = watching(flying(), objects := [car(12, 0, 17)])
-    harness.run(0.5)
-    objects[0] = SeenObject("person", 10, 0, track_id=18, track_score=0.8)
+    first, other = car(12, 0, 17), walker(10, 0, 18, visible=False)
+    harness = watching(first, other)
+    first.visible, other.visible = False, True
     harness.run(5.0)
-    reason = refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
+    reason = refused(harness, "follow track=17")
     assert "track 17 ended 3 s ago" in reason
     assert "present: 1 person" in reason
 
 
 def test_track_that_is_missed_for_a_moment_is_accepted() -> None:
-    seen = car(12, 0, 17)
-    harness = watching(flying(), [seen])
-    harness.run(0.5)
+    harness = watching(seen := car(12, 0, 17))
     seen.visible = False
     harness.run(1.5)
-    engaged(harness, FollowBehaviour(Follow(Subject(track_id=17))))
+    engaged(harness, "follow track=17")
     assert harness.guidance.busy
 
 
 def test_track_whose_object_has_another_id_now_is_accepted() -> None:
-    seen = car(12, 0, 17)
-    harness = watching(flying(), [seen])
-    harness.run(0.5)
+    harness = watching(seen := car(12, 0, 17))
     seen.visible = False
     harness.run(0.5)
     seen.visible, seen.track_id = True, 23
     harness.run(3.0)
-    engaged(harness, FollowBehaviour(Follow(Subject(track_id=17))))
+    engaged(harness, "follow track=17")
     (note,) = [event.message for event in harness.events if event.kind is EventKind.NOTED]
     assert note == "track 17: the object is track 23 now"
     assert "track 23 (was 17)" in harness.guidance.status
@@ -134,100 +126,79 @@ def test_track_whose_object_has_another_id_now_is_accepted() -> None:
 
 def test_range_of_the_class_of_a_track_is_required() -> None:
     means = RangeMeans(depth=False, ground=False, classes=frozenset({"person"}))
-    harness = watching(flying(), [car(12, 0, 17)], ranging=means)
-    harness.run(0.5)
-    assert "a range to a car" in refused(harness, FollowBehaviour(Follow(Subject(track_id=17))))
+    assert "a range to a car" in refused(watching(car(12, 0, 17), ranging=means), "follow track=17")
 
 
 # --- flights
 
 
-def test_follow_keeps_to_the_farther_car() -> None:
-    near, far = car(12, 0, 1), car(20, 3, 2)
-    vehicle = KinematicVehicle()
+# Command, what is seen, which of them is meant, and how far from it the flight ends.
+FLOWN: dict[str, tuple[str, list[SeenObject], int, float]] = {
+    "follow the farther": (
+        "follow track=2",
+        [
+            car(12, 0, 1, then=lambda seconds: {"north": 12 + seconds}),
+            car(20, 3, 2, then=lambda seconds: {"north": 20 + seconds}),
+        ],
+        1,
+        8.0,
+    ),
+    "approach the farther": ("approach track=2", [car(15, 0, 1), car(25, 8, 2)], 1, 5.0),
+    "orbit the farther": ("orbit track=2 radius=8 speed=3 laps=1", [car(12, 0, 1), car(16, 5, 2)], 1, 8.0),
+    "back with its id": (
+        "follow track=1",
+        [car(12, 0, 1, then=lambda s: {"north": 12 + 2.0 * s, "visible": not 8.0 <= s < 9.5})],
+        0,
+        8.0,
+    ),
+}
 
-    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        near.north, far.north = 12 + 1.0 * seconds, 20 + 1.0 * seconds
 
-    assert Flight(FollowBehaviour(Follow(Subject(track_id=2))), vehicle, [near, far]).run(20.0, each) is None
-    assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(8.0, abs=0.8)
-
-
-def test_approach_flies_to_the_farther_car() -> None:
-    near, far = car(15, 0, 1), car(25, 8, 2)
-    vehicle = KinematicVehicle()
-    outcome = assert_succeeded(
-        Flight(ApproachBehaviour(Approach(Subject(track_id=2))), vehicle, [near, far]).run(60.0)
-    )
-    assert outcome.reason.startswith("reached track 2 at")
-    assert math.dist(vehicle.position[:2], (far.north, far.east)) == pytest.approx(5.0, abs=0.4)
-
-
-def test_orbit_is_about_the_track() -> None:
-    flight = Flight(
-        OrbitBehaviour(Orbit(radius_m=8.0, speed_mps=3.0, laps=1.0, subject=Subject(track_id=2))),
-        objects=[car(12, 0, 1), car(16, 5, 2)],
-    )
-    flight.latency_s = 0.0  # it begins after the first frame, as its requirement demands
-    assert_succeeded(flight.run(60.0))
-    ends = flight.track[-1]
-    assert math.dist(ends[:2], (16, 5)) == pytest.approx(8.0, abs=0.6)
+@pytest.mark.parametrize("case", FLOWN)
+def test_track_that_was_given_is_flown_to(case: str) -> None:
+    command, objects, meant, wanted_m = FLOWN[case]
+    # An orbit begins after the first frame, as its requirement demands.
+    flight, outcome = flown(command, *objects, seconds=25.0, latency_s=0.0 if "orbit" in case else 0.1)
+    if not command.startswith("follow"):
+        assert_succeeded(outcome)
+    if command.startswith("approach"):
+        assert known(outcome).reason.startswith("reached track 2 at")
+    assert flight.distance_m(meant) == pytest.approx(wanted_m, abs=0.4 if "approach" in case else 0.8)
 
 
 @pytest.mark.parametrize(
-    "behaviour",
-    [
-        FollowBehaviour(Follow(Subject(track_id=1))),
-        ApproachBehaviour(Approach(Subject(track_id=1), distance_m=2.0)),
-    ],
+    ("command", "wanted_m"), [("follow track=1", 8.0), ("approach track=1 distance=2", 2.0)]
 )
-def test_object_that_gets_another_id_in_its_place_is_flown_to_on(
-    behaviour: FollowBehaviour | ApproachBehaviour,
-) -> None:
+def test_object_that_gets_another_id_in_its_place_is_flown_to_on(command: str, wanted_m: float) -> None:
     """As after it left the image for a moment, because the vehicle leaned forward."""
-    seen = car(25, 0, 1)
-
-    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        seen.visible, seen.track_id = not 4.0 <= seconds < 5.0, 1 if seconds < 4.5 else 9
-
-    flight = Flight(behaviour, objects=[seen])
-    outcome = flight.run(30.0, each)
+    changing = car(25, 0, 1, then=lambda s: {"visible": not 4.0 <= s < 5.0, "track_id": 1 if s < 4.5 else 9})
+    flight, outcome = flown(command, changing, seconds=30.0)
     assert outcome is None or outcome.success, outcome
-    wanted_m = 8.0 if isinstance(behaviour, FollowBehaviour) else 2.0
-    assert math.dist(flight.track[-1][:2], (25, 0)) == pytest.approx(wanted_m, abs=0.6)
+    assert flight.distance_m() == pytest.approx(wanted_m, abs=0.6)
     (note,) = flight.notes
     assert note.startswith("track 1: ")
     assert "track 9 " in note
-    assert "track 9 (was 1)" in behaviour.status
+    assert "track 9 (was 1)" in flight.behaviour.status
 
 
-@pytest.mark.parametrize(
-    "behaviour",
-    [
-        FollowBehaviour(Follow(Subject(track_id=1))),
-        ApproachBehaviour(Approach(Subject(track_id=1), distance_m=2.0)),
-    ],
-)
-def test_object_seen_beside_the_track_never_takes_its_place(
-    behaviour: FollowBehaviour | ApproachBehaviour,
-) -> None:
-    seen, beside = car(25, 0, 1), car(25, 4.0, 9)
+BESIDE = car(25, 4.0, 9, then=lambda s: {"east": max(0.0, min(4.0, 4.0 - 2.0 * (s - 4.0)))})
+FAR_AWAY = car(45, 20, 9)
 
-    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        seen.visible = seconds < 4.0
-        beside.east = max(0.0, min(4.0, 4.0 - 2.0 * (seconds - 4.0)))
 
-    outcome = assert_failed(Flight(behaviour, objects=[seen, beside]).run(30.0, each))
+@pytest.mark.parametrize("other", [BESIDE, FAR_AWAY], ids=["beside it", "far away"])
+@pytest.mark.parametrize("command", ["follow track=1", "approach track=1 distance=2"])
+def test_another_object_never_takes_the_place_of_a_lost_track(command: str, other: SeenObject) -> None:
+    lost = car(25, 0, 1, then=lambda seconds: {"visible": seconds < 4.0})
+    outcome = assert_failed(flown(command, lost, other, seconds=30.0)[1])
     assert outcome.reason.startswith("lost track 1 for")
-    assert "track 9, a car, is 0." in outcome.reason
+    assert ("track 9, a car, is 0." in outcome.reason) is (other is BESIDE)
+    assert ("track 9" in outcome.reason) is (other is BESIDE)
 
 
 def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
     """The command was answered when it began."""
-    seen = car(12, 0, 17)
-    harness = watching(flying(), [seen])
-    harness.run(0.5)
-    command = harness.command(FollowBehaviour(Follow(Subject(track_id=17))), endless=True)
+    harness = watching(seen := car(12, 0, 17))
+    command = harness.command("follow track=17", endless=True)
     assert harness.outcome(command).success
     harness.run(2.0)
     seen.track_id, seen.east = 23, 4.8
@@ -239,34 +210,8 @@ def test_loss_of_a_track_that_is_followed_is_an_event() -> None:
     assert "track 23, a car, is " in note.message
 
 
-def test_track_that_comes_back_with_its_id_is_followed_on() -> None:
-    seen = car(12, 0, 1)
-    vehicle = KinematicVehicle()
-
-    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        seen.north, seen.visible = 12 + 2.0 * seconds, not 8.0 <= seconds < 9.5
-
-    assert Flight(FollowBehaviour(Follow(Subject(track_id=1))), vehicle, [seen]).run(25.0, each) is None
-    assert math.dist(vehicle.position[:2], (seen.north, 0)) == pytest.approx(8.0, abs=0.8)
-
-
-def test_lost_track_far_from_all_others_names_none() -> None:
-    seen, other = car(12, 0, 1), car(30, 20, 2)
-
-    def each(seconds: float, _vehicle: KinematicVehicle) -> None:
-        seen.visible = seconds < 5.0
-
-    outcome = known(
-        Flight(FollowBehaviour(Follow(Subject(track_id=1))), objects=[seen, other]).run(30.0, each)
-    )
-    assert "track 2" not in outcome.reason
-
-
 def test_unconfirmed_track_is_not_flown_to() -> None:
-    ghost = car(15, 0, 1, trusted=False)
-    assert_failed(
-        Flight(ApproachBehaviour(Approach(Subject(track_id=1))), objects=[ghost]).run(20.0), "not confirmed"
-    )
+    assert_failed(flown("approach track=1", car(15, 0, 1, trusted=False), seconds=20.0)[1], "not confirmed")
 
 
 def test_wanted_is_a_class_a_track_or_a_marker() -> None:
@@ -318,5 +263,4 @@ def test_mission_step_points_the_gimbal_at_a_track() -> None:
     log = flight.fly(PointGimbalBehaviour(Subject(track_id=1)), 15.0, warm_up_s=0.0)
     assert_succeeded(log.outcome)
     gimbal = known(flight.state.gimbal)
-    assert gimbal.pitch_rad is not None
-    assert math.degrees(gimbal.pitch_rad) == pytest.approx(-20.0, abs=4.0)
+    assert math.degrees(known(gimbal.pitch_rad)) == pytest.approx(-20.0, abs=4.0)

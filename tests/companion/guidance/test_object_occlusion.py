@@ -11,7 +11,8 @@ from companion.guidance.objects.in_view import CHOOSING_S, Choice, ObjectsInView
 from companion.guidance.objects.table import DOUBT_S, ObjectTable
 from companion.guidance.objects.target import RangeSource, Target
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
-from tests.companion.guidance.one_object import OneObject
+from tests.companion.guidance.guidance_harness import known
+from tests.companion.guidance.one_object import T0, OneObject, seen_car
 
 SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
 
@@ -19,19 +20,10 @@ SPEED_MPS, BEHIND_M, FRAME_S = 3.0, 8.0, 0.1
 def seen(
     position: tuple[float, float], vehicle: tuple[float, float, float], seconds: float, identity: int
 ) -> Target:
-    north, east = position[0] - vehicle[0], position[1] - vehicle[1]
-    return Target(
-        "car",
-        0.9,
-        round(seconds * 1e9),
-        math.atan2(east, north),
-        -0.3,
-        math.hypot(north, east),
-        RangeSource.GROUND_PLANE,
-        (*position, 0.0),
-        track_id=identity,
-        track_score=0.9,
-    )
+    return seen_car(
+        position, seconds / FRAME_S, vehicle=vehicle,
+        confidence=0.9, track_id=identity, track_score=0.9, range_sigma_m=math.nan,
+    )  # fmt: skip
 
 
 class Road:
@@ -59,12 +51,12 @@ class Road:
                     for name, (north, east) in beside.items()
                 ],
                 self.vehicle,
-                round(self.seconds * 1e9),
+                T0 + round(self.seconds * 1e9),
             )
 
     @property
     def off_m(self) -> float:
-        return math.dist(self.track.now.position_at(round(self.seconds * 1e9))[:2], self.car)
+        return math.dist(self.track.now.position_at(T0 + round(self.seconds * 1e9))[:2], self.car)
 
 
 @pytest.fixture
@@ -125,7 +117,7 @@ def test_own_id_without_a_rival_is_followed_in_a_turn(road: Road, turn_deg: floa
     for index in range(1, 31):
         road.seconds += FRAME_S
         road.track.update([seen(car(FRAME_S * index), (*corner, -4.0), road.seconds, 1)], (*corner, -4.0))
-    now_ns = round(road.seconds * 1e9)
+    now_ns = T0 + round(road.seconds * 1e9)
     assert road.track.now.last_ns == now_ns
     assert math.dist(road.track.now.position_at(now_ns)[:2], car(3.0)) < 0.5
     assert (
@@ -197,7 +189,7 @@ def choose(frames: list[list[Target]]) -> TrackedObject | Target | None:
     table, found = ObjectTable(), None
     choices: dict[Subject, Choice] = {}
     for index, targets in enumerate(frames):
-        now_ns = round((index + 1) * FRAME_S * 1e9)
+        now_ns = T0 + round((index + 1) * FRAME_S * 1e9)
         stamped = [replace(target, captured_ns=now_ns) for target in targets]
         objects = table.update(stamped, (0.0, 0.0, -4.0), now_ns)
         in_view = ObjectsInView(objects, now_ns=now_ns, _choices=choices)
@@ -228,8 +220,7 @@ def test_nearest_object_ahead_is_chosen() -> None:
         targets = [seen(place, (0.0, 0.0, -4.0), 0.0, index) for index, place in enumerate(positions)]
         found = choose([targets] * (round(CHOOSING_S / FRAME_S) + 2))
         assert found is not None
-        assert found.position_ned_m is not None
-        return tuple(round(value, 3) for value in found.position_ned_m[:2])
+        return tuple(round(value, 3) for value in known(found.position_ned_m)[:2])
 
     assert chosen((56.0, 1.0), (10.0, 0.9)) == (10.0, 0.9)
     # Away from the nose only the direction counts.

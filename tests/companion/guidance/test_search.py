@@ -1,3 +1,5 @@
+"""The patterns of a search cover their area."""
+
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -6,13 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.guidance.behaviours.seek import SearchBehaviour, Seek
-from companion.guidance.command import NO_CONTEXT
-from companion.guidance.grammar import parse
-from companion.guidance.objects.target import DOUBTED
 from companion.guidance.search_pattern import Footprint, expanding_square, lawnmower
-from tests.companion.guidance.guidance_harness import Flight, assert_succeeded, known
-from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject
 
 
 def beside(point: tuple[float, float], points: Sequence[tuple[float, float]]) -> float:
@@ -60,40 +56,3 @@ def test_steep_camera_needs_narrow_strips() -> None:
     assert Footprint(math.radians(80), 0.0).spacing_m(10.0) == pytest.approx(
         0.8 * 2 * 25 * math.tan(math.radians(40))
     )
-
-
-@pytest.mark.parametrize(
-    "text", ["pattern=square radius=12 spacing=8", "pattern=lawnmower width=24 height=16 spacing=8"]
-)
-def test_search_finds_an_object_hidden_from_the_centre(text: str) -> None:
-    car = SeenObject("car", 6.0, -9.0, track_id=4)
-
-    def each(seconds: float, vehicle: KinematicVehicle) -> None:
-        # Small objects are seen only from near.
-        car.visible = math.dist((car.north, car.east), vehicle.position[:2]) < 9.0
-
-    vehicle = KinematicVehicle()
-    outcome = assert_succeeded(
-        Flight(parse(f"seek car {text}").build(NO_CONTEXT), vehicle, [car]).run(240.0, each)
-    )
-    bearing = math.atan2(car.east - vehicle.position[1], car.north - vehicle.position[0])
-    assert abs(math.remainder(bearing - vehicle.yaw_rad, math.tau)) < math.radians(5)
-    assert outcome.reason.startswith("found a car")
-
-
-def test_search_covers_the_area_and_reports_the_reason() -> None:
-    doubtful = SeenObject("car", 6.0, 2.0, trusted=False)
-    flight = Flight(
-        SearchBehaviour(Seek("car", pattern="square", radius_m=8.0, spacing_m=8.0)),
-        KinematicVehicle(),
-        [doubtful],
-    )
-    outcome = known(flight.run(120.0))
-    assert outcome.reason.endswith(DOUBTED)
-
-
-def test_search_without_footprint_needs_spacing() -> None:
-    outcome = known(
-        Flight(SearchBehaviour(Seek("car", pattern="square", radius_m=30.0)), KinematicVehicle()).run(1.0)
-    )
-    assert outcome.reason.endswith("set spacing")
