@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from companion.guidance.behaviour import OF_THE_MOMENT, Outcome, Requirement
-from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.core import GuidanceOptions
@@ -19,13 +18,21 @@ from companion.guidance.interface import GuidanceInput
 from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
-from companion.guidance.missions.mission_file import MissionError, plan_from
+from companion.guidance.missions.mission_file import MissionError
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.ranging import RangeMeans
 from companion.vehicle.state import FlightMode, LandedState
-from tests.companion.guidance.guidance_harness import GuidanceHarness, Pending, ScriptedGimbal, parked
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    Pending,
+    ScriptedGimbal,
+    assert_failed,
+    mission,
+    parked,
+    standing,
+)
 from vision.obstacle_sectors import SECTORS, ObstacleSectors
 
 CLASSES = ("person", "car")
@@ -113,7 +120,7 @@ def _change(name: str, value: object) -> Callable[[World], None]:
     return lambda made: made.changes.update({name: value})
 
 
-FAULTS: dict[Requirement, Callable[[World], None]] = {
+FAULTS: dict[str, Callable[[World], None]] = {
     Requirement.POSITION: _without_position,
     Requirement.PERCEPTION: _without_frames,
     Requirement.BATTERY: lambda made: setattr(made.harness.autopilot, "battery_fraction", 0.1),
@@ -123,26 +130,27 @@ FAULTS: dict[Requirement, Callable[[World], None]] = {
     Requirement.GIMBAL: _without_gimbal,
     Requirement.NEIGHBOURS: _change("neighbourhood", Neighbourhood("own")),
     Requirement.HOME: _without_home,
+    "charge": lambda made: setattr(made.harness.autopilot, "battery_fraction", None),
+    "depth": _change("obstacles", None),
 }
+# What every flight needs.
+OF_ALL = {"charge", "depth", Requirement.BATTERY, Requirement.POSITION, Requirement.HOME}
 
 
-def mission(harness: GuidanceHarness, *steps: str, on_failure: str = "rtl") -> SequenceBehaviour:
-    text = "".join(
-        f'[[step]]\ndo = "{step}"\ntimeout_s = 60\non_failure = "{on_failure}"\n' for step in steps
-    )
-    return SequenceBehaviour(plan_from(text, "test.toml"), harness.guidance.check_requirements)
+def planned(harness: GuidanceHarness, *steps: str, on_failure: str = "rtl") -> SequenceBehaviour:
+    return mission(harness, *steps, each={"timeout_s": 60, "on_failure": on_failure})
 
 
 def started(made: World, *steps: str, on_failure: str = "rtl") -> Pending:
     harness = made.harness
-    pending = harness.command(mission(harness, *steps, on_failure=on_failure))
+    pending = harness.command(planned(harness, *steps, on_failure=on_failure))
     harness.run(6.0)  # longer than a command waits for a gimbal
     return pending
 
 
 def test_every_command_is_in_the_table() -> None:
     assert {step.split()[0] for step in STEPS} | NOT_FLOWN == set(COMMANDS)
-    assert set(FAULTS) | OF_THE_MOMENT == set(Requirement)
+    assert set(FAULTS) | OF_THE_MOMENT == {*Requirement, "charge", "depth"}
 
 
 @pytest.mark.parametrize("step", STEPS)
@@ -155,63 +163,36 @@ def test_mission_with_all_it_needs_arms(step: str) -> None:
 @pytest.mark.parametrize(
     ("step", "missing"),
     [
-        (step, requirement)
+        (step, missing)
         for step in STEPS
-        for requirement in sorted(parse(step).build(NO_CONTEXT).requirements - OF_THE_MOMENT)
+        for missing in sorted((parse(step).build(NO_CONTEXT).requirements - OF_THE_MOMENT) | OF_ALL)
     ],
 )
 @pytest.mark.parametrize("on_failure", ["rtl", "continue", "abort"])
-def test_missing_part_refuses_a_mission_disarmed(step: str, missing: Requirement, on_failure: str) -> None:
+def test_missing_part_refuses_a_mission_disarmed(step: str, missing: str, on_failure: str) -> None:
     made = world()
     FAULTS[missing](made)
     made.harness.run(1.0)  # the last position is too old by then
-    pending = started(made, "takeoff 4", step, on_failure=on_failure)
-    assert not pending.result().success
+    assert not started(made, "takeoff 4", step, on_failure=on_failure).result().success
     assert made.harness.autopilot.requests == []
     assert not made.harness.vehicle.armed
 
 
-@pytest.mark.parametrize("step", STEPS)
 @pytest.mark.parametrize(
-    "fault",
+    ("step", "word"),
     [
-        _change("obstacles", None),
-        lambda made: setattr(made.harness.autopilot, "battery_fraction", 0.1),
-        lambda made: setattr(made.harness.autopilot, "battery_fraction", None),
-        _without_position,
-        _without_home,
+        ("seek zebra", "zebra"),
+        ("approach zebra", "zebra"),
+        ("patrol points=0,0;5,5 classes=zebra laps=1", "zebra"),
+        ("goto 300 0", "limits"),
+        ("goto 5 0 altitude=70", "limits"),
+        ("follow-path points=0,0;0,400", "limits"),
+        ("patrol points=0,0;400,5 classes=car laps=1", "limits"),
     ],
 )
-def test_needs_of_all_flights_refuse_a_mission_disarmed(step: str, fault: Callable[[World], None]) -> None:
+def test_unknown_class_or_far_goal_refuses_a_mission_disarmed(step: str, word: str) -> None:
     made = world()
-    fault(made)
-    made.harness.run(1.0)
-    assert not started(made, "takeoff 4", step).result().success
-    assert made.harness.autopilot.requests == []
-
-
-@pytest.mark.parametrize(
-    "step", ["seek zebra", "approach zebra", "patrol points=0,0;5,5 classes=zebra laps=1"]
-)
-def test_unknown_class_refuses_a_mission_disarmed(step: str) -> None:
-    made = world()
-    assert not started(made, "takeoff 4", step).result().success
-    assert made.harness.autopilot.requests == []
-
-
-@pytest.mark.parametrize(
-    "step",
-    [
-        "goto 300 0",
-        "goto 5 0 altitude=70",
-        "follow-path points=0,0;0,400",
-        "patrol points=0,0;400,5 classes=car laps=1",
-    ],
-)
-def test_goal_beyond_the_limits_refuses_a_mission_disarmed(step: str) -> None:
-    made = world()
-    outcome = started(made, "takeoff 4", "hold 1", step).result()
-    assert "limits" in outcome.reason
+    assert_failed(started(made, "takeoff 4", "hold 1", step).result(), word)
     assert made.harness.autopilot.requests == []
 
 
@@ -229,23 +210,19 @@ def test_unknown_command_of_a_step_is_refused_when_read() -> None:
         mission(GuidanceHarness(parked()), "takeoff 4", "circle-of-a-plugin 5")
 
 
-@pytest.mark.parametrize(
-    ("fault", "word"),
-    [(_without_position, "position"), (_without_home, "home"), (_change("obstacles", None), "depth")],
-)
-def test_takeoff_is_refused_before_it_arms(fault: Callable[[World], None], word: str) -> None:
+@pytest.mark.parametrize("missing", [Requirement.POSITION, Requirement.HOME, "depth"])
+def test_takeoff_is_refused_before_it_arms(missing: str) -> None:
     made = world()
-    fault(made)
+    FAULTS[missing](made)
     made.harness.run(1.0)
-    outcome = made.harness.outcome(made.harness.command(TakeoffBehaviour(4.0)), 5.0)
-    assert word in outcome.reason
+    assert_failed(made.harness.outcome(made.harness.command("takeoff 4"), 5.0), missing)
     assert made.harness.autopilot.requests == []
 
 
 def test_takeoff_waits_for_the_first_report_of_home() -> None:
     made = world()
     _without_home(made)
-    pending = made.harness.command(TakeoffBehaviour(4.0))
+    pending = made.harness.command("takeoff 4")
     made.harness.run(2.0)
     assert made.harness.autopilot.requests == []
     made.home = True
@@ -257,39 +234,20 @@ def test_ardupilot_takes_off_without_a_known_home() -> None:
     state = made.harness.autopilot.state
     made.changes["state"] = replace(state, home_altitude_amsl_m=None, autopilot="ArduPilot")
     made.harness.run(0.1)
-    made.harness.command(TakeoffBehaviour(4.0))
+    made.harness.command("takeoff 4")
     assert "arm" in made.harness.autopilot.requests
 
 
 # --- a failed take-off --------------------------------------------------------------------------------------
 
 
-def refused_on_the_ground() -> GuidanceHarness:
-    harness = GuidanceHarness(parked())
-    harness.autopilot.refuse_takeoff = "no home"
-    harness.run(0.1)
-    return harness
-
-
-def test_refused_takeoff_disarms_what_it_armed() -> None:
-    harness = refused_on_the_ground()
-    outcome = harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0)
-    assert outcome == Outcome(False, "no home")
-    harness.run(1.0)
-    assert harness.autopilot.requests == ["arm", "disarm"]
-    assert not harness.vehicle.armed
-
-
-@pytest.mark.parametrize("on_failure", ["abort", "continue", "rtl", "land"])
-def test_refused_takeoff_of_a_mission_disarms(on_failure: str) -> None:
-    harness = refused_on_the_ground()
-    harness.outcome(harness.command(mission(harness, "takeoff 4", "hold 1", on_failure=on_failure)), 5.0)
-    harness.run(1.0)
-    assert harness.autopilot.requests == ["arm", "disarm"]
-    assert not harness.vehicle.armed
-
-
 LOW_M = 1.5  # flown by setpoints from the ground
+
+
+def refused_on_the_ground() -> GuidanceHarness:
+    harness = standing()
+    harness.autopilot.refuse_takeoff = "no home"
+    return harness
 
 
 def on_ground() -> GuidanceHarness:
@@ -298,9 +256,7 @@ def on_ground() -> GuidanceHarness:
     def grounded(inputs: GuidanceInput) -> GuidanceInput:
         return replace(inputs, state=replace(inputs.state, landed=LandedState.ON_GROUND, autopilot="PX4"))
 
-    harness = GuidanceHarness(parked(), inputs=grounded)
-    harness.run(0.1)
-    return harness
+    return standing(inputs=grounded)
 
 
 def assert_disarmed(harness: GuidanceHarness) -> None:
@@ -311,89 +267,86 @@ def assert_disarmed(harness: GuidanceHarness) -> None:
     assert harness.outputs[-1].setpoint is None
 
 
-@pytest.mark.parametrize("altitude_m", [4.0, LOW_M])
-def test_takeoff_that_never_lifts_disarms(altitude_m: float) -> None:
+@pytest.mark.parametrize("on_failure", ["", "abort", "continue", "rtl", "land"])
+def test_refused_takeoff_disarms_what_it_armed(on_failure: str) -> None:
+    harness = refused_on_the_ground()
+    steps = planned(harness, "takeoff 4", "hold 1", on_failure=on_failure) if on_failure else "takeoff 4"
+    outcome = harness.outcome(harness.command(steps), 5.0)
+    assert on_failure or outcome == Outcome(False, "no home")
+    assert_disarmed(harness)
+    assert harness.autopilot.requests == ["arm", "disarm"]
+
+
+@pytest.mark.parametrize(
+    ("heights_m", "on_failure"),
+    [([4.0], ""), ([LOW_M], ""), ([LOW_M, 4.0], "abort"), ([LOW_M, 4.0], "continue")],
+)
+def test_takeoff_that_never_lifts_disarms(heights_m: list[float], on_failure: str) -> None:
     harness = on_ground()
-    assert not harness.outcome(harness.command(TakeoffBehaviour(altitude_m))).success
+    steps = [f"takeoff {height_m}" for height_m in heights_m]
+    command = planned(harness, *steps, on_failure=on_failure) if on_failure else steps[0]
+    assert harness.outcome(harness.command(command)).success is (on_failure == "continue")
     assert_disarmed(harness)
 
 
-@pytest.mark.parametrize("on_failure", ["abort", "continue"])
-def test_low_takeoff_of_a_mission_that_never_lifts_disarms(on_failure: str) -> None:
-    harness = on_ground()
-    steps = mission(harness, f"takeoff {LOW_M}", "takeoff 4", on_failure=on_failure)
-    assert harness.outcome(harness.command(steps)).success is (on_failure == "continue")
-    assert_disarmed(harness)
-
-
-def test_error_in_a_low_takeoff_on_the_ground_disarms(monkeypatch: pytest.MonkeyPatch) -> None:
-    harness = on_ground()
-    behaviour = TakeoffBehaviour(LOW_M)
+@pytest.mark.parametrize("word", ["ZeroDivisionError", "position"])
+def test_failure_in_a_low_takeoff_on_the_ground_disarms(word: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    harness, behaviour = on_ground(), TakeoffBehaviour(LOW_M)
     pending = harness.command(behaviour)
     harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
-    monkeypatch.setattr(behaviour, "update", lambda dt_s, context: 1 / 0)
-    assert "ZeroDivisionError" in harness.outcome(pending).reason
-    assert_disarmed(harness)
-
-
-def test_position_lost_in_a_low_takeoff_on_the_ground_disarms() -> None:
-    harness = on_ground()
-    pending = harness.command(TakeoffBehaviour(LOW_M))
-    harness.until(lambda: harness.guidance.phase is Phase.OFFBOARD, 5.0)
-    harness.autopilot.position_alive = False
-    assert "position" in harness.outcome(pending).reason
+    if word == "position":
+        harness.autopilot.position_alive = False
+    else:
+        monkeypatch.setattr(behaviour, "update", lambda dt_s, context: 1 / 0)
+    assert_failed(harness.outcome(pending), word)
     assert_disarmed(harness)
 
 
 def test_stop_before_the_takeoff_disarms() -> None:
-    harness = GuidanceHarness(parked(), lag_s=0.5)
-    harness.run(0.6)
-    harness.command(TakeoffBehaviour(4.0))
+    harness = standing(lag_s=0.5)
+    harness.command("takeoff 4")
     harness.until(lambda: harness.autopilot.state.armed, 2.0)
     harness.autopilot.cancel(2)
     harness.vehicle.mode = FlightMode.HOLD
-    harness.command(StopBehaviour())
+    harness.command("stop")
     harness.run(3.0)
     assert harness.autopilot.requests[-1] == "disarm"
 
 
-def test_vehicle_that_was_armed_before_stays_armed() -> None:
-    harness = refused_on_the_ground()
+def armed_before(harness: GuidanceHarness) -> None:
+    harness.autopilot.refuse_takeoff = "no home"
     harness.vehicle.armed = True
-    harness.run(0.1)
-    assert not harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0).success
-    harness.run(1.0)
-    assert harness.autopilot.requests == []
-    assert harness.vehicle.armed
+    harness.run(0.5)
+    harness.command("takeoff 4")
 
 
-def test_pilot_who_took_over_keeps_it_armed() -> None:
-    harness = GuidanceHarness(parked(), lag_s=0.2)
-    harness.run(0.3)
-    pending = harness.command(TakeoffBehaviour(4.0))
+def taken_over(harness: GuidanceHarness) -> None:
+    """By a pilot, after arming."""
+    harness.command("takeoff 4")
     harness.until(lambda: harness.vehicle.armed, 2.0)
     harness.autopilot.change_mode(FlightMode.POSITION)
     harness.vehicle.landed = LandedState.ON_GROUND
-    assert not harness.outcome(pending, 5.0).success
-    harness.run(2.0)
-    assert "disarm" not in harness.autopilot.requests
-    assert harness.vehicle.armed
 
 
-def test_vehicle_in_the_air_is_not_disarmed() -> None:
-    harness = GuidanceHarness(parked())
-    harness.run(0.1)
-    harness.command(TakeoffBehaviour(4.0))
+def in_the_climb(harness: GuidanceHarness) -> None:
+    harness.command("takeoff 4")
     harness.until(lambda: harness.vehicle.landed is LandedState.TAKING_OFF)
-    harness.command(StopBehaviour())
+    harness.command("stop")
+
+
+@pytest.mark.parametrize("end", [armed_before, taken_over, in_the_climb])
+def test_vehicle_of_others_or_in_the_air_stays_armed(end: Callable[[GuidanceHarness], None]) -> None:
+    harness = standing(lag_s=0.2)
+    end(harness)
     harness.run(3.0)
+    assert not harness.results[1].success
     assert "disarm" not in harness.autopilot.requests
     assert harness.vehicle.armed
 
 
 def test_new_takeoff_cancels_the_pending_disarming() -> None:
     harness = refused_on_the_ground()
-    harness.outcome(harness.command(TakeoffBehaviour(4.0)), 5.0)
+    harness.outcome(harness.command("takeoff 4"), 5.0)
     request = harness.outputs[-1].requests[-1]
-    harness.command(TakeoffBehaviour(4.0))
+    harness.command("takeoff 4")
     assert request.identifier in harness.outputs[-1].cancelled
