@@ -98,8 +98,7 @@ def test_limited_setpoint_passes_again_unchanged(asked: Setpoint, state: Vehicle
         if first is not None:
             assert second == pytest.approx(first, abs=1e-6)
     if once.yaw_rad is not None:
-        assert again.yaw_rad is not None
-        assert wrap_angle(again.yaw_rad - once.yaw_rad) == pytest.approx(0.0, abs=1e-6)
+        assert wrap_angle(known(again.yaw_rad) - once.yaw_rad) == pytest.approx(0.0, abs=1e-6)
     assert again.yaw_rate_radps == once.yaw_rate_radps
 
 
@@ -118,26 +117,41 @@ def test_setpoint_inside_the_limits_is_the_same_object(velocity: Vector3, positi
 @given(positions, states)
 def test_position_stays_inside_the_altitude_band(position: Vector3, state: VehicleState) -> None:
     sent, _ = Envelope(LIMITS).apply(Setpoint.position(position, NOW), state, NOW, 0.02)
-    assert sent.position_ned_m is not None
-    north, east, down = sent.position_ned_m
+    north, east, down = known(sent.position_ned_m)
     here = known(state.position_ned_m)
     assert math.dist((north, east), here[:2]) <= LIMITS.max_horizontal_speed_mps + 1e-6
     assert -LIMITS.max_climb_mps - 1e-6 <= down - here[2] <= LIMITS.max_descend_mps + 1e-6
 
 
-def test_position_outside_the_fence_is_moved_inside() -> None:
-    state = vehicle((199.0, 0.0, -49.5))
-    sent, reasons = Envelope(LIMITS).apply(Setpoint.position((300.0, 0.0, -80.0), NOW), state, NOW, 0.02)
-    assert sent.position_ned_m == pytest.approx((200.0, 0.0, -50.0))
-    assert len(reasons) == 2
+def within(half_m: float) -> Fence:
+    return Fence(((-half_m, -half_m), (half_m, -half_m), (half_m, half_m), (-half_m, half_m)))
+
+
+SQUARE = within(15.0)
+
+
+@pytest.mark.parametrize(
+    ("limits", "here", "asked", "sent", "reasons"),
+    [
+        (LIMITS, (199.0, 0.0, -49.5), (300.0, 0.0, -80.0), (200.0, 0.0, -50.0), 2),
+        (Limits(fence=SQUARE), (12.0, 0.0, -5.0), (30.0, 0.0, -5.0), (14.5, 0.0, -5.0), 1),
+    ],
+    ids=["circle", "polygon"],
+)
+def test_position_outside_the_fence_is_moved_inside(
+    limits: Limits, here: Vector3, asked: Vector3, sent: Vector3, reasons: int
+) -> None:
+    moved, why = Envelope(limits).apply(Setpoint.position(asked, NOW), vehicle(here), NOW, 0.02)
+    assert moved.position_ned_m == pytest.approx(sent)
+    assert len(why) == reasons
+    assert any("fence" in reason or "distance" in reason for reason in why)
 
 
 def test_velocity_grows_with_limited_acceleration() -> None:
     envelope, state, previous = Envelope(LIMITS), vehicle(), 0.0
     for _ in range(40):
         sent, _ = envelope.apply(Setpoint.velocity((4.0, 0.0, 0.0), NOW), state, NOW, 0.05)
-        assert sent.velocity_ned_mps is not None
-        speed = sent.velocity_ned_mps[0]
+        speed = known(sent.velocity_ned_mps)[0]
         assert speed - previous <= LIMITS.max_acceleration_mps2 * 0.05 + 1e-9
         previous = speed
     assert previous == pytest.approx(4.0)
@@ -156,8 +170,7 @@ def test_after_reset_velocity_starts_from_the_measured_one() -> None:
     sent, _ = envelope.apply(
         Setpoint.velocity((4.0, 0.0, 0.0), NOW), vehicle(velocity=(3.0, 0.0, 0.0)), NOW, 0.1
     )
-    assert sent.velocity_ned_mps is not None
-    assert sent.velocity_ned_mps[0] == pytest.approx(3.0 + LIMITS.max_acceleration_mps2 * 0.1)
+    assert known(sent.velocity_ned_mps)[0] == pytest.approx(3.0 + LIMITS.max_acceleration_mps2 * 0.1)
 
 
 @pytest.mark.parametrize(
@@ -175,8 +188,7 @@ def test_no_outward_velocity_at_a_fence(
     asked: Vector3, state: VehicleState, component: int, sign: int
 ) -> None:
     sent, reasons = settled(Envelope(LIMITS), Setpoint.velocity(asked, NOW), state)
-    assert sent.velocity_ned_mps is not None
-    assert sent.velocity_ned_mps[component] * sign <= 1e-9
+    assert known(sent.velocity_ned_mps)[component] * sign <= 1e-9
     assert reasons
 
 
@@ -206,19 +218,39 @@ def test_velocity_along_or_away_from_the_fence_is_kept() -> None:
 def test_fence_is_centred_on_home() -> None:
     state = vehicle((250.0, 0.0, -10.0), home=(200.0, 0.0, 5.0))
     sent, _ = settled(Envelope(LIMITS), Setpoint.velocity((3.0, 0.0, 0.0), NOW), state)
-    assert sent.velocity_ned_mps is not None
-    assert sent.velocity_ned_mps[0] == pytest.approx(3.0)
+    assert known(sent.velocity_ned_mps)[0] == pytest.approx(3.0)
 
 
-def test_vehicle_flown_at_the_fence_stops_inside() -> None:
-    envelope, north, speed = Envelope(LIMITS), 150.0, 0.0
-    for _ in range(2000):
-        state = vehicle((north, 0.0, -10.0), (speed, 0.0, 0.0))
-        sent, _ = envelope.apply(Setpoint.velocity((5.0, 0.0, 0.0), NOW), state, NOW, 0.02)
-        assert sent.velocity_ned_mps is not None
-        speed += (sent.velocity_ned_mps[0] - speed) * 0.02 / 0.3
-        north += speed * 0.02
-    assert 199.0 < north < 200.3
+def fast(acceleration_mps2: float) -> Limits:
+    return Limits(max_horizontal_speed_mps=20.0, max_acceleration_mps2=acceleration_mps2, fence=within(50.0))
+
+
+@pytest.mark.parametrize(
+    ("limits", "start_m", "asked", "lag_s", "end_m", "over_m"),
+    [
+        (LIMITS, 150.0, (5.0, 0.0, 0.0), 0.3, (199.0, 0.0), 200.3),
+        (Limits(fence=SQUARE), 0.0, (4.0, 2.0, 0.0), 0.3, (14.0, 14.0), 15.0),
+        *(
+            (fast(acceleration_mps2), -40.0, (20.0, 0.0, 0.0), lag_s, (40.0, 0.0), 50.0)
+            for acceleration_mps2 in (2.0, 5.0, 10.0, 20.0)
+            for lag_s in (0.2, 0.4)
+        ),
+    ],
+)
+def test_vehicle_flown_at_a_fence_stops_inside(
+    limits: Limits, start_m: float, asked: Vector3, lag_s: float, end_m: tuple[float, float], over_m: float
+) -> None:
+    flown, envelope = KinematicVehicle(position=[start_m, 0.0, -5.0], lag_s=lag_s), Envelope(limits)
+    reasons: set[str] = set()
+    for _ in range(3000):
+        setpoint = Setpoint.velocity(asked, flown.now_ns)
+        sent, why = envelope.apply(setpoint, flown.state, flown.now_ns, 0.02)
+        reasons.update(why)
+        flown.fly(sent, 0.02)
+        assert max(flown.position[:2]) < over_m
+    assert flown.position[0] > end_m[0]
+    assert flown.position[1] >= end_m[1]
+    assert any("fence" in reason or "distance" in reason for reason in reasons)
 
 
 def test_yaw_setpoint_is_rate_limited() -> None:
@@ -260,47 +292,20 @@ def test_invalid_limits_are_rejected_by_name(arguments: SomeLimits) -> None:
         Limits(**arguments)
 
 
-def test_vehicle_flown_at_a_polygon_stops_inside() -> None:
-    fence = Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0)))
-    limits = Limits(fence=fence)
-    vehicle, envelope = KinematicVehicle(), Envelope(limits)
-    reasons: set[str] = set()
-    for _ in range(1500):
-        setpoint = Setpoint.velocity((4.0, 2.0, 0.0), vehicle.now_ns)
-        sent, why = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
-        reasons.update(why)
-        vehicle.fly(sent, 0.02)
-        assert fence.contains((vehicle.position[0], vehicle.position[1]))
-    assert vehicle.position[0] > 14.0
-    assert vehicle.position[1] > 14.0
-    assert any("fence" in reason for reason in reasons)
-
-
-def test_position_beyond_a_polygon_is_clipped() -> None:
-    limits = Limits(fence=Fence(((-15.0, -15.0), (15.0, -15.0), (15.0, 15.0), (-15.0, 15.0))))
-    vehicle = KinematicVehicle(position=[12.0, 0.0, -5.0])
-    setpoint = Setpoint.position((30.0, 0.0, -5.0), vehicle.now_ns)
-    sent, why = Envelope(limits).apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
-    assert sent.position_ned_m == pytest.approx((14.5, 0.0, -5.0))
-    assert any("fence" in reason for reason in why)
-
-
 def test_steep_velocity_keeps_its_direction() -> None:
     asked = Setpoint.velocity((8.0, 0.0, -8.0), 1)
     sent, why = Envelope(Limits(max_acceleration_mps2=20.0)).apply(asked, KinematicVehicle().state, 1, 0.2)
-    assert sent.velocity_ned_mps is not None
-    north, _, down = sent.velocity_ned_mps
+    north, _, down = known(sent.velocity_ned_mps)
     assert down == pytest.approx(-2.0)
     assert north == pytest.approx(2.0)
     assert any("climb" in reason for reason in why)
 
 
 def test_last_home_is_kept_and_fence_needs_a_home() -> None:
-    fence = Fence(((50.0, -50.0), (150.0, -50.0), (150.0, 50.0), (50.0, 50.0)))
     vehicle = KinematicVehicle(position=[149.0, 0.0, -5.0])
     homeless = replace(vehicle.state, home_position_ned_m=None)
     at_home = replace(vehicle.state, home_position_ned_m=(100.0, 0.0, 0.0))
-    limits = Limits(fence=Fence(((-50.0, -50.0), (50.0, -50.0), (50.0, 50.0), (-50.0, 50.0))))
+    limits = Limits(fence=within(50.0))
     out = Setpoint.velocity((5.0, 0.0, 0.0), 1)
     envelope = Envelope(limits)
     sent, why = envelope.apply(out, homeless, 1, 0.02)
@@ -310,23 +315,6 @@ def test_last_home_is_kept_and_fence_needs_a_home() -> None:
     envelope.reset()
     again, _ = envelope.apply(out, homeless, 1, 0.02)
     assert again.velocity_ned_mps == pytest.approx(first.velocity_ned_mps)
-    assert fence.contains((149.0, 0.0))
-
-
-@pytest.mark.parametrize("acceleration_mps2", [2.0, 5.0, 10.0, 20.0])
-@pytest.mark.parametrize("lag_s", [0.2, 0.4])
-def test_strong_braking_does_not_overshoot_the_fence(acceleration_mps2: float, lag_s: float) -> None:
-    limits = Limits(
-        max_horizontal_speed_mps=20.0,
-        max_acceleration_mps2=acceleration_mps2,
-        fence=Fence(((-50.0, -50.0), (50.0, -50.0), (50.0, 50.0), (-50.0, 50.0))),
-    )
-    vehicle, envelope = KinematicVehicle(position=[-40.0, 0.0, -5.0], lag_s=lag_s), Envelope(limits)
-    for _ in range(3000):
-        setpoint = Setpoint.velocity((20.0, 0.0, 0.0), vehicle.now_ns)
-        sent, _ = envelope.apply(setpoint, vehicle.state, vehicle.now_ns, 0.02)
-        vehicle.fly(sent, 0.02)
-        assert vehicle.position[0] < 50.0
 
 
 def feed_forward(
@@ -334,50 +322,35 @@ def feed_forward(
 ) -> tuple[Vector3 | None, tuple[str, ...]]:
     """The limited feed-forward of a vehicle that is commanded its current velocity."""
     vehicle = KinematicVehicle(position=list(position), velocity=list(velocity))
-    limits = Limits(fence=Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0))))
+    limits = Limits(fence=within(20.0))
     setpoint = Setpoint.velocity(velocity, 1, acceleration_ned_mps2=acceleration)
     sent, why = Envelope(limits).apply(setpoint, vehicle.state, 1, 0.02)
     return sent.acceleration_ned_mps2, why
 
 
-def test_feed_forward_inside_the_limits_is_unchanged() -> None:
-    assert feed_forward((0.0, 2.0, 0.0), (4.0, 0.0, 0.0)) == ((0.0, 2.0, 0.0), ())
+HERE = (0.0, 0.0, -5.0)
+# Acceleration, velocity, position, and what is left of the acceleration.
+FEED_FORWARD: dict[str, tuple[Vector3, Vector3, Vector3, Vector3 | None]] = {
+    "inside the limits": ((0.0, 2.0, 0.0), (4.0, 0.0, 0.0), HERE, (0.0, 2.0, 0.0)),
+    "more than the greatest": ((0.0, 30.0, 0.0), (4.0, 0.0, 0.0), HERE, (0.0, 3.0, 0.0)),
+    "slow": ((0.0, 3.0, 0.0), (0.5, 0.0, 0.0), HERE, (0.0, 0.5, 0.0)),
+    "stopped": ((0.0, 3.0, 0.0), (0.0, 0.0, 0.0), HERE, None),
+    "away from a fence": ((-2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.0, 0.0, -5.0), (-2.0, 0.0, 0.0)),
+    "to a fence": ((2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.4, 0.0, -5.0), None),
+    "over the fence": ((3.0, 0.0, 0.0), (0.0, 1.0, 0.0), (19.9, 0.0, -5.0), None),
+    "over the greatest speed": ((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), HERE, (0.0, 0.0, 0.0)),
+    "above the greatest altitude": ((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -49.9), None),
+    "below the lowest altitude": ((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -1.1), None),
+    "faster down than allowed": ((0.0, 0.0, 3.0), (0.0, 0.0, 0.9), (0.0, 0.0, -20.0), None),
+}
 
 
-def test_feed_forward_is_limited_to_max_acceleration() -> None:
-    left, _ = feed_forward((0.0, 30.0, 0.0), (4.0, 0.0, 0.0))
-    assert left == pytest.approx((0.0, 3.0, 0.0))
-    left, _ = feed_forward((0.0, 3.0, 0.0), (0.5, 0.0, 0.0))
-    assert left == pytest.approx((0.0, 0.5, 0.0))
-
-
-def test_stop_has_no_feed_forward() -> None:
-    assert feed_forward((0.0, 3.0, 0.0))[0] is None
-
-
-def test_feed_forward_away_from_a_fence_is_kept() -> None:
-    inwards, _ = feed_forward((-2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.0, 0.0, -5.0))
-    assert inwards == pytest.approx((-2.0, 0.0, 0.0))
-    outwards, why = feed_forward((2.0, 0.0, 0.0), (0.0, 4.0, 0.0), (19.4, 0.0, -5.0))
-    assert outwards is None
-    assert why
-
-
-@pytest.mark.parametrize(
-    ("acceleration", "velocity", "position"),
-    [
-        pytest.param((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, -5.0), id="over the greatest speed"),
-        pytest.param((3.0, 0.0, 0.0), (0.0, 1.0, 0.0), (19.9, 0.0, -5.0), id="over the fence"),
-        pytest.param((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -49.9), id="above the greatest altitude"),
-        pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.0), (0.0, 0.0, -1.1), id="below the lowest altitude"),
-        pytest.param((0.0, 0.0, 3.0), (0.0, 0.0, 0.9), (0.0, 0.0, -20.0), id="faster down than allowed"),
-    ],
-)
-def test_feed_forward_does_not_violate_a_limit(
-    acceleration: Vector3, velocity: Vector3, position: Vector3
-) -> None:
-    left, _ = feed_forward(acceleration, velocity, position)
-    assert math.hypot(*(left or (0.0,))) < 1e-6
+@pytest.mark.parametrize("case", FEED_FORWARD)
+def test_feed_forward_is_limited(case: str) -> None:
+    acceleration, velocity, position, expected = FEED_FORWARD[case]
+    left, why = feed_forward(acceleration, velocity, position)
+    assert left == (expected if expected is None else pytest.approx(expected))
+    assert bool(why) is (case in ("to a fence", "over the fence"))
 
 
 KNOWN = KinematicVehicle(position=[0.0, 0.0, -5.0]).state

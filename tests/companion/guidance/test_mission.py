@@ -18,7 +18,6 @@ from companion.guidance.missions.mission_file import (
     read_mission,
 )
 from companion.guidance.missions.sequence import ABORT, END, LAND, RTL
-from tests.companion.command_line import companion_here
 
 NAMES = ("person", "car", "traffic light")
 DOCUMENT = Path(__file__).parents[3] / "docs" / "how-to" / "missions.md"
@@ -98,9 +97,17 @@ def test_problem_is_one_line_with_file_and_step(text: str, parts: str) -> None:
     assert "\n" not in line
 
 
-def test_all_problems_are_reported_together() -> None:
-    text = "[[step]]\ndo = 'fly'\n[[step]]\ndo = 'seek zebra'\non_failure = 'nowhere'\n[[step]]\ndo = 'land'"
-    assert [line.split(":")[1].strip() for line in problems(text)] == ["step 1", "step 2", "step 2"]
+LOOP = """
+[[step]]
+name = "a"
+do = "hold 1"
+{exit}
+[[step]]
+do = "hold 2"
+on_success = "a"
+{more}
+"""
+OUT = 'on_failure = "continue"\n[[step]]\nname = "out"\ndo = "land"'
 
 
 @pytest.mark.parametrize(
@@ -108,16 +115,7 @@ def test_all_problems_are_reported_together() -> None:
     ["visits = 3", "on_failure = 'rtl'", "on_failure = 'land'", "on_failure = 'end'", "on_failure = 'out'"],
 )
 def test_loop_with_an_exit_is_allowed(exit_line: str) -> None:
-    text = (
-        f"[[step]]\nname = 'a'\ndo = 'hold 1'\n{exit_line}\n"
-        "[[step]]\ndo = 'hold 2'\non_success = 'a'\non_failure = 'continue'\n"
-        "[[step]]\nname = 'out'\ndo = 'land'\n"
-    )
-    text = (
-        text if "out'" in exit_line else text.replace("on_failure = 'continue'\n[[step]]\nname = 'out'", "#")
-    )
-    text = text.replace("#\ndo = 'land'\n", "")
-    plan_from(text, "m.toml")
+    assert plan_from(LOOP.format(exit=exit_line, more=OUT if "out" in exit_line else ""), "m.toml").steps
 
 
 def test_class_takes_the_detectors_spelling() -> None:
@@ -190,41 +188,11 @@ def test_unreadable_file_is_reported(tmp_path: Path) -> None:
         read_mission(path)
 
 
-def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path: Path) -> None:
-    options = ("--check", "--model", exported_model)
-    done = companion_here("mission", "demo", *options, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    title, first = done.stdout.splitlines()[:2]
-    assert title == "mission demo: 5 steps"
-    assert first.startswith("1. takeoff altitude=4 → find; ")
-    assert first.endswith("failure → rtl")
-    (tmp_path / "bad.toml").write_text("[[step]]\nname = 'look'\ndo = 'seek zebra'\n")
-    done = companion_here("mission", "bad.toml", *options, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.startswith("companion: bad.toml: step 1 (look)")
-    assert "'zebra'" in done.stderr
-    assert done.stderr.count("\n") == 1
-    done = companion_here("mission", "demo", *options, "--detector-runtime", "torch", cwd=tmp_path)
-    assert done.returncode == 2
-    assert "cannot run .onnx files" in done.stderr
-
-
 @pytest.mark.parametrize("name", ["x" * 300, "\0", ".", "/", "a/" * 3000])
 def test_impossible_file_name_is_a_one_line_error(name: str) -> None:
     with pytest.raises(MissionError) as error:
         find_mission(name)
     assert "\n" not in str(error.value)
-
-
-def test_table_and_command_problems_are_reported_together() -> None:
-    text = '[[step]]\ndo = "takeoff 500"\n[[step]]\ndo = "hovr"\nrepeat = 0\n'
-    text += '[[step]]\ndo = "land"\nspeed = 3\n'
-    with pytest.raises(MissionError) as failure:
-        plan_from(text, "m.toml")
-    problems = failure.value.problems
-    assert len(problems) == 4
-    assert [sum(f"step {step}" in problem for problem in problems) for step in (1, 2, 3)] == [1, 2, 1]
 
 
 def test_faults_of_tables_names_branches_and_graph_come_at_once() -> None:

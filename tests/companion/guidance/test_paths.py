@@ -11,18 +11,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.geometry.geodesy import north_east
 from companion.guidance import grammar
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome
 from companion.guidance.behaviours.figure_eight import FigureEightBehaviour, lemniscate
-from companion.guidance.behaviours.follow_path import FollowPathBehaviour
 from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.path import ACCELERATION_MPS2, Path, PathFollower
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import Vector3, VehicleState
-from tests.companion.guidance.guidance_harness import STEP_S, Flight, assert_failed, assert_succeeded
+from companion.vehicle.state import Vector3
+from tests.companion.guidance.guidance_harness import STEP_S, Flight, assert_failed, assert_succeeded, known
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.attitude import wrap_angle
 
@@ -31,12 +29,10 @@ positions = st.tuples(*[st.floats(-50, 50)] * 3)
 
 
 def active(
-    behaviour: Behaviour, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
+    command: Behaviour | str, seconds: float = 120.0, vehicle: KinematicVehicle | None = None
 ) -> tuple[Flight, Outcome]:
-    flight = Flight(behaviour, vehicle or KinematicVehicle(), limits=WIDE)
-    outcome = flight.run(seconds)
-    assert outcome is not None, behaviour.status
-    return flight, outcome
+    flight = Flight(command, vehicle or KinematicVehicle(), limits=WIDE)
+    return flight, known(flight.run(seconds))
 
 
 def off_the_line(position: Sequence[float], start: Sequence[float], end: Sequence[float]) -> float:
@@ -47,43 +43,71 @@ def off_the_line(position: Sequence[float], start: Sequence[float], end: Sequenc
     return math.dist(position, [a + fraction * w for a, w in zip(start, path, strict=True)])
 
 
-def test_goto_flies_straight_with_yaw_along_the_path() -> None:
-    flight, outcome = active(GotoBehaviour(Goto(north_m=20.0, east_m=-10.0, altitude_m=8.0)))
-    assert outcome.success
-    assert math.dist(flight.vehicle.position, (20.0, -10.0, -8.0)) < 0.5
-    assert max(off_the_line(position, (0, 0, -5), (20, -10, -8)) for position in flight.track) < 0.3
-    assert flight.vehicle.yaw_rad == pytest.approx(math.atan2(-10, 20), abs=0.1)
-    assert (
-        max(
-            math.hypot(*(b - a for a, b in zip(*pair, strict=True)))
-            for pair in zip(flight.track, flight.track[1:], strict=False)
-        )
-        < 3.2 * STEP_S
-    )
+@dataclass(frozen=True)
+class Way:
+    """A command, and the points that the vehicle passes in this order, in lines from where it is.
+
+    Attributes:
+        within_m: of the lines and of the points.
+    """
+
+    command: str
+    points: list[Vector3]
+    within_m: float = 0.8
+    start: Vector3 = (0.0, 0.0, -5.0)
+    yaw_rad: float = 0.0
 
 
-def test_goto_in_body_frame_with_a_heading() -> None:
-    vehicle = KinematicVehicle(position=[5.0, 5.0, -5.0], yaw_rad=math.pi / 2)
-    flight, outcome = active(
-        GotoBehaviour(Goto(forward_m=10.0, right_m=2.0, heading_deg=math.degrees(math.pi))), vehicle=vehicle
-    )
-    assert outcome.success
-    assert math.dist(flight.vehicle.position, (3.0, 15.0, -5.0)) < 0.5
-    assert abs(wrap_angle(flight.vehicle.yaw_rad - math.pi)) < 0.05
+def level(*points: tuple[float, float]) -> list[Vector3]:
+    return [(north, east, -5.0) for north, east in points]
 
 
-@pytest.mark.parametrize(
-    "behaviour", [GotoBehaviour(Goto(forward_m=0.0, right_m=0.0)), FollowPathBehaviour([(0.0, 0.0)], 3.0)]
-)
-def test_path_to_the_current_position_succeeds(behaviour: Behaviour) -> None:
-    _, outcome = active(behaviour, 10.0)
-    assert outcome.success
+RING = level((0, 0), (15, 0), (15, 15), (0, 15))
+WAYS = {
+    "straight": Way("goto 20 -10 altitude=8", [(20, -10, -8)], 0.5),
+    "in the body frame": Way(
+        "goto forward=10 right=2 heading=180", level((3, 15)), 0.5, (5.0, 5.0, -5.0), math.pi / 2
+    ),
+    "where it is": Way("goto forward=0 right=0", level((0, 0))),
+    "one point, where it is": Way("follow-path 0,0", level((0, 0))),
+    "steep, within the climb limit": Way("goto 30 0 altitude=35 speed=8", [(30, 0, -35)], 1.5),
+    "corners": Way(
+        "follow-path 0,0;20,0;20,20,8;0,20 speed=4", [*level((0, 0), (20, 0)), (20, 20, -8), (0, 20, -8)]
+    ),
+    "there and back": Way("follow-path 10,0;0,0", level((10, 0), (0, 0))),
+    "there and back again": Way("follow-path 0,0;4,0 laps=3", level(*[(0, 0), (4, 0)] * 3, (0, 0))),
+    "closed": Way(
+        "follow-path 0,0;15,0;15,15;0,15 speed=4 laps=2", [*RING * 2, RING[0]], 1.5, (15.0, -15.0, -5.0)
+    ),
+    "closed, from far away": Way(
+        "follow-path 0,0;15,0;15,15;0,15 laps=2", [*RING * 2, RING[0]], 1.0, (-40.0, 0.0, -5.0)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WAYS)
+def test_way_is_flown_in_order_along_its_lines(name: str) -> None:
+    way = WAYS[name]
+    vehicle = KinematicVehicle(position=list(way.start), yaw_rad=way.yaw_rad)
+    flight, outcome = active(way.command, 200.0, vehicle)
+    assert_succeeded(outcome, *(["2 laps"] if "closed" in name else []))
+    begin = 0
+    for point in way.points:
+        near = (math.dist(here, point) < way.within_m for here in flight.track[begin:])
+        begin += next(index for index, passed in enumerate(near) if passed)
+    assert math.dist(vehicle.position, way.points[-1]) < 0.5
+    legs = [leg for leg in itertools.pairwise([way.start, *way.points]) if leg[0] != leg[1]]
+    assert all(min(off_the_line(here, *leg) for leg in legs) < way.within_m for here in flight.track if legs)
+    if name == "straight":
+        assert vehicle.yaw_rad == pytest.approx(math.atan2(-10, 20), abs=0.1)
+        steps_m = [math.dist(*pair) for pair in itertools.pairwise(flight.track)]
+        assert max(steps_m) < 3.2 * STEP_S
+    if name == "in the body frame":
+        assert abs(wrap_angle(vehicle.yaw_rad - math.pi)) < 0.05
 
 
 def test_goto_by_latitude_needs_a_global_position() -> None:
-    behaviour = GotoBehaviour(Goto(latitude_deg=47.0, longitude_deg=8.0))
-    _, outcome = active(behaviour)
-    assert_failed(outcome, "not received")
+    assert_failed(active("goto latitude=47 longitude=8")[1], "not received")
 
 
 def test_goto_by_latitude_and_longitude() -> None:
@@ -99,40 +123,27 @@ def test_goto_by_latitude_and_longitude() -> None:
     behaviour.on_activate(BehaviourContext(vehicle.now_ns, state))
     step = behaviour.update(0.0, BehaviourContext(vehicle.now_ns, state))
     assert isinstance(step, Setpoint)
-    assert behaviour._follower is not None
-    assert behaviour._follower.path.length_m == pytest.approx(11.12, abs=0.01)
+    assert known(behaviour._follower).path.length_m == pytest.approx(11.12, abs=0.01)
     assert step.velocity_ned_mps is not None
     assert step.velocity_ned_mps[0] > 0.3
     assert abs(step.velocity_ned_mps[1]) < 1e-6
 
 
-@dataclass
-class WrongVelocity(KinematicVehicle):
+def wrong_velocity(error_mps: float) -> KinematicVehicle:
     """Its estimate of the velocity is too far east, and that is what it controls."""
-
-    error_mps: float = 0.5
-
-    @property
-    def state(self) -> VehicleState:
-        north, east, down = self.velocity
-        return replace(super().state, velocity_ned_mps=(north, east + self.error_mps, down))
-
-    def fly(self, setpoint: Setpoint, dt_s: float) -> None:
-        assert setpoint.velocity_ned_mps is not None
-        north, east, down = setpoint.velocity_ned_mps
-        super().fly(replace(setpoint, velocity_ned_mps=(north, east - self.error_mps, down)), dt_s)
+    return KinematicVehicle(velocity_error=(0.0, error_mps, 0.0))
 
 
 def test_goto_arrives_though_the_estimated_speed_is_wrong() -> None:
-    flight, outcome = active(GotoBehaviour(Goto(north_m=15.0, east_m=0.0)), 60.0, WrongVelocity())
+    flight, outcome = active("goto 15 0", 60.0, wrong_velocity(0.5))
     assert outcome.success, outcome.reason
     assert math.dist(flight.vehicle.position, (15.0, 0.0, -5.0)) < 0.5
 
 
 @pytest.mark.parametrize(("error_mps", "reached"), [(1.0, True), (1.8, False)])
 def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, reached: bool) -> None:
-    vehicle = WrongVelocity(error_mps=error_mps)
-    _, outcome = active(GotoBehaviour(Goto(north_m=15.0, east_m=0.0)), 60.0, vehicle)
+    vehicle = wrong_velocity(error_mps)
+    _, outcome = active("goto 15 0", 60.0, vehicle)
     away_m = math.dist(vehicle.position, (15.0, 0.0, -5.0))
     assert outcome.success
     assert outcome.goal_ned_m == (15.0, 0.0, -5.0)
@@ -141,40 +152,8 @@ def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, r
 
 
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
-    flight = Flight(GotoBehaviour(Goto(north_m=60.0, east_m=0.0)), limits=Limits(max_distance_m=30.0))
+    flight = Flight("goto north=60 east=0", limits=Limits(max_distance_m=30.0))
     assert_failed(flight.run(120.0), "no progress", "guidance")
-
-
-def test_path_passes_all_points_and_slows_at_corners() -> None:
-    points = [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0, 8.0), (0.0, 20.0)]
-    flight, outcome = active(FollowPathBehaviour(points, 4.0))
-    assert outcome.success, outcome.reason
-    corners = [(0, 0, -5), (20, 0, -5), (20, 20, -8), (0, 20, -8)]
-    for corner in corners:
-        assert min(math.dist(corner, position) for position in flight.track) < 0.8
-    legs = list(itertools.pairwise(corners))
-    assert max(min(off_the_line(position, *leg) for leg in legs) for position in flight.track) < 0.8
-
-
-def test_closed_path_is_repeated_from_far_away() -> None:
-    points = [(0.0, 0.0), (12.0, 0.0), (12.0, 12.0), (0.0, 12.0)]
-    vehicle = KinematicVehicle(position=[-40.0, 0.0, -5.0])
-    flight, outcome = active(FollowPathBehaviour(points, 3.0, laps=2.0), 200.0, vehicle)
-    assert_succeeded(outcome, "2 laps")
-    times_by = sum(
-        math.dist(a, (12, 12, -5)) > 1.0 >= math.dist(b, (12, 12, -5))
-        for a, b in zip(flight.track, flight.track[1:], strict=False)
-    )
-    assert times_by == 2
-
-
-def test_path_reversal_is_flown_to_its_end() -> None:
-    flight, outcome = active(FollowPathBehaviour([(10.0, 0.0), (0.0, 0.0)], 3.0))
-    assert outcome.success
-    assert max(position[0] for position in flight.track) > 9.5
-    flight, outcome = active(FollowPathBehaviour([(0.0, 0.0), (4.0, 0.0)], 3.0, laps=3.0))
-    assert outcome.success
-    assert sum(a[0] < 3.4 <= b[0] for a, b in itertools.pairwise(flight.track)) == 3
 
 
 def test_route_ahead_ends_at_a_reversal_until_it_is_reached() -> None:
@@ -190,25 +169,8 @@ def test_route_ahead_ends_at_a_reversal_until_it_is_reached() -> None:
     assert follower.along_m >= 10.0
 
 
-def test_closed_path_starts_at_its_first_point() -> None:
-    points = [(0.0, 0.0), (15.0, 0.0), (15.0, 15.0), (0.0, 15.0)]
-    vehicle = KinematicVehicle(position=[15.0, -15.0, -5.0])
-    flight, outcome = active(FollowPathBehaviour(points, 4.0, laps=2.0), 200.0, vehicle)
-    assert outcome.success
-    first = next(i for i, position in enumerate(flight.track) if math.dist(position, (0, 0, -5)) < 1.5)
-    second = next(i for i, position in enumerate(flight.track) if math.dist(position, (15, 15, -5)) < 1.5)
-    assert first < second
-
-
-def test_steep_path_stays_on_its_line_within_climb_limit() -> None:
-    flight, outcome = active(GotoBehaviour(Goto(north_m=30.0, east_m=0.0, altitude_m=35.0, speed_mps=8.0)))
-    assert outcome.success
-    assert max(off_the_line(position, (0, 0, -5), (30, 0, -35)) for position in flight.track) < 1.5
-
-
 def test_slow_climb_keeps_its_speed() -> None:
-    behaviour = GotoBehaviour(Goto(forward_m=0.0, right_m=0.0, altitude_m=8.0, speed_mps=0.2))
-    flight, outcome = active(behaviour)
+    flight, outcome = active("goto forward=0 right=0 altitude=8 speed=0.2")
     assert outcome.success
     steps = itertools.pairwise(flight.track)
     assert max(abs(b[2] - a[2]) for a, b in steps) < 0.25 * STEP_S
@@ -272,24 +234,3 @@ def test_progress_is_monotonic_and_velocities_finite(points: list[Vector3], posi
         assert all(map(math.isfinite, velocity))
         assert follower.along_m >= before
         before = follower.along_m
-
-
-@given(st.floats(-60, 60), st.floats(-180, 180), st.floats(-2000, 2000), st.floats(-2000, 2000))
-def test_north_east_agrees_with_the_ellipsoid(
-    latitude: float, longitude: float, north_m: float, east_m: float
-) -> None:
-    """Compared with the chord between both points in earth-centred coordinates."""
-
-    def earth_centred(position: tuple[float, float]) -> Vector3:
-        phi, lam = map(math.radians, position)
-        normal = 6378137.0 / math.sqrt(1 - 6.694379990141e-3 * math.sin(phi) ** 2)
-        return (
-            normal * math.cos(phi) * math.cos(lam),
-            normal * math.cos(phi) * math.sin(lam),
-            normal * (1 - 6.694379990141e-3) * math.sin(phi),
-        )
-
-    there = (latitude + north_m / 111_000, longitude + east_m / (111_000 * math.cos(math.radians(latitude))))
-    found = north_east((latitude, longitude), there)
-    chord = math.dist(earth_centred((latitude, longitude)), earth_centred(there))
-    assert math.hypot(*found) == pytest.approx(chord, abs=0.02)

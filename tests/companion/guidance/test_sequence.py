@@ -1,5 +1,6 @@
 """Missions in lockstep with the real guidance, streamer and envelope."""
 
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -7,7 +8,6 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome, Requirement
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import EventKind
-from companion.guidance.missions.mission_file import plan_from
 from companion.guidance.missions.sequence import Plan, PlannedStep, SequenceBehaviour
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
@@ -15,20 +15,16 @@ from companion.vehicle.state import FlightMode
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     Pending,
+    ScriptedAutopilot,
     assert_failed,
     assert_succeeded,
     flying,
+    hovering,
     known,
+    mission,
     parked,
 )
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
-
-
-def mission(harness: GuidanceHarness, *steps: dict[str, Any], **top: float | str) -> SequenceBehaviour:
-    text = "".join(f"{key} = {value!r}\n" for key, value in top.items())
-    for step in steps:
-        text += "[[step]]\n" + "".join(f"{key} = {value!r}\n" for key, value in step.items())
-    return SequenceBehaviour(plan_from(text, "test.toml"), harness.guidance.check_requirements)
 
 
 def begun(harness: GuidanceHarness, behaviour: Behaviour) -> Pending:
@@ -37,10 +33,14 @@ def begun(harness: GuidanceHarness, behaviour: Behaviour) -> Pending:
 
 
 def flown(
-    *steps: dict[str, Any], of: KinematicVehicle | None = None, **top: float
+    *steps: str | dict[str, Any],
+    of: KinematicVehicle | None = None,
+    prepare: Callable[[ScriptedAutopilot], object] = lambda autopilot: None,
+    **top: Any,
 ) -> tuple[GuidanceHarness, SequenceBehaviour, Outcome]:
     """A mission from its start, by default in the air, to its end."""
     harness = GuidanceHarness(of or flying())
+    prepare(harness.autopilot)
     behaviour = mission(harness, *steps, **top)
     return harness, behaviour, known(harness.outcome(begun(harness, behaviour)))
 
@@ -51,10 +51,10 @@ def messages(harness: GuidanceHarness) -> list[str]:
 
 def test_mission_from_takeoff_to_landing() -> None:
     harness, behaviour, outcome = flown(
-        {"do": "takeoff 5"},
+        "takeoff 5",
         {"do": "goto 6 0", "name": "out"},
         {"do": "hold 2", "name": "wait"},
-        {"do": "land"},
+        "land",
         of=parked(),
     )
     assert outcome == Outcome(True, "flown, 4 steps")
@@ -70,9 +70,7 @@ def test_mission_from_takeoff_to_landing() -> None:
 
 def test_setpoints_continue_between_steps() -> None:
     harness = GuidanceHarness(flying())
-    behaviour = mission(
-        harness, {"do": "hold 1", "repeat": 2}, {"do": "goto 3 0"}, {"do": "orbit radius=3 laps=0.5"}
-    )
+    behaviour = mission(harness, {"do": "hold 1", "repeat": 2}, "goto 3 0", "orbit radius=3 laps=0.5")
     future = begun(harness, behaviour)
     harness.until(lambda: harness.guidance.phase == "offboard")
     while not future.done():
@@ -87,17 +85,13 @@ def test_setpoints_continue_between_steps() -> None:
 
 
 def test_takeoff_after_a_landing_step() -> None:
-    harness, _, outcome = flown(
-        {"do": "takeoff 3"}, {"do": "land"}, {"do": "takeoff 4"}, {"do": "hold 1"}, {"do": "rtl"}, of=parked()
-    )
+    harness, _, outcome = flown("takeoff 3", "land", "takeoff 4", "hold 1", "rtl", of=parked())
     assert_succeeded(outcome)
     assert harness.autopilot.requests.count("arm") == 2
 
 
 def test_failed_step_ends_the_mission_in_hold() -> None:
-    harness, _, outcome = flown(
-        {"do": "hold 1"}, {"do": "hold 60", "name": "long", "timeout_s": 2}, {"do": "land"}
-    )
+    harness, _, outcome = flown("hold 1", {"do": "hold 60", "name": "long", "timeout_s": 2}, "land")
     assert_failed(outcome, "step 2 of 3 (long)", "timed out after 2 s: holding")
     assert harness.guidance.phase == "offboard"
     assert isinstance(harness.guidance.behaviour, HoldBehaviour)
@@ -105,16 +99,14 @@ def test_failed_step_ends_the_mission_in_hold() -> None:
 
 
 def test_on_failure_branches_are_taken() -> None:
-    harness = GuidanceHarness(flying())
-    steps: list[dict[str, Any]] = [
+    _, behaviour, outcome = flown(
         {"do": "hold 60", "timeout_s": 1, "on_failure": "other"},
         {"do": "hold 1", "name": "skipped"},
         {"do": "hold 0.5", "name": "other", "on_failure": "skipped"},
         {"do": "hold 60", "timeout_s": 1, "name": "ignored", "on_failure": "continue"},
         {"do": "hold 0.5", "name": "last", "on_success": "end"},
-    ]
-    behaviour = mission(harness, *steps)
-    assert_succeeded(harness.outcome(begun(harness, behaviour)))
+    )
+    assert_succeeded(outcome)
     titles = [record.title for record in behaviour.records]
     assert titles == ["hold duration=60", "other", "ignored", "last"]
     assert [record.success for record in behaviour.records] == [False, True, False, True]
@@ -134,41 +126,36 @@ def test_on_failure_rtl_or_land_still_fails_the_mission(branch: str, mode: Fligh
 
 
 def test_refused_step_fails_with_its_requirement() -> None:
-    _, _, outcome = flown(
-        {"do": "takeoff 3"}, {"do": "land"}, {"do": "hold 5", "name": "too late"}, {"do": "land"}, of=parked()
-    )
+    _, _, outcome = flown("takeoff 3", "land", {"do": "hold 5", "name": "too late"}, "land", of=parked())
     assert_failed(outcome, "step 3 of 4 (too late)", "in the air")
 
 
 def test_first_step_requirement_refuses_the_mission() -> None:
     harness = GuidanceHarness(flying())
     current = begun(harness, HoldBehaviour())
-    refused = harness.command(mission(harness, {"do": "takeoff 3"}, {"do": "land"}))
+    refused = harness.command(mission(harness, "takeoff 3", "land"))
     assert_failed(refused.result(), "mission needs ", "the ground")
     assert not current.done()
     # A mission with a branch for that failure is flown.
-    behaviour = mission(harness, {"do": "takeoff 3", "on_failure": "continue"}, {"do": "hold 1"})
+    behaviour = mission(harness, {"do": "takeoff 3", "on_failure": "continue"}, "hold 1")
     assert_succeeded(harness.outcome(harness.command(behaviour)))
     assert_failed(current.result(), "replaced by ", " mission")
 
 
 def test_unknown_class_refuses_the_whole_mission() -> None:
-    harness = GuidanceHarness(flying(), class_names=("person", "car"))
-    harness.run(0.1)
-    outcome = harness.command(mission(harness, {"do": "hold 1"}, {"do": "seek zebra"})).result()
+    harness = hovering(class_names=("person", "car"))
+    outcome = harness.command(mission(harness, "hold 1", "seek zebra")).result()
     assert_failed(outcome, "a detector ", "knows zebra")
 
 
 def test_refused_mode_fails_only_its_step() -> None:
-    harness = GuidanceHarness(flying())
-    harness.autopilot.refuse[FlightMode.LAND] = "land refused"
-    behaviour = mission(
-        harness,
-        {"do": "hold 0.5"},
+    harness, behaviour, outcome = flown(
+        "hold 0.5",
         {"do": "land", "name": "down", "on_failure": "stay"},
         {"do": "hold 1", "name": "stay", "on_failure": "down"},
+        prepare=lambda autopilot: autopilot.refuse.update({FlightMode.LAND: "land refused"}),
     )
-    assert_succeeded(harness.outcome(begun(harness, behaviour)))
+    assert_succeeded(outcome)
     assert [(record.title, record.success) for record in behaviour.records][1:] == [
         ("down", False),
         ("stay", True),
@@ -178,25 +165,24 @@ def test_refused_mode_fails_only_its_step() -> None:
 
 
 def test_refused_offboard_fails_the_step_and_stops_stream() -> None:
-    harness = GuidanceHarness(flying())
-    harness.autopilot.refuse[FlightMode.OFFBOARD] = "offboard refused"
-    behaviour = mission(harness, {"do": "hold 1", "name": "stay", "on_failure": "land"})
-    outcome = harness.outcome(begun(harness, behaviour))
+    _, _, outcome = flown(
+        {"do": "hold 1", "name": "stay", "on_failure": "land"},
+        prepare=lambda autopilot: autopilot.refuse.update({FlightMode.OFFBOARD: "offboard refused"}),
+    )
     assert_failed(outcome, "(stay)", "offboard refused", "landed and disarmed")
 
 
 def test_refused_arming_ends_the_mission_on_the_ground() -> None:
-    harness = GuidanceHarness(parked())
-
-    harness.autopilot.refuse_arming = "no GPS"
-    outcome = assert_failed(harness.outcome(begun(harness, mission(harness, {"do": "takeoff 3"}))))
-    assert outcome.reason.endswith("no GPS")
+    harness, _, outcome = flown(
+        "takeoff 3", of=parked(), prepare=lambda autopilot: setattr(autopilot, "refuse_arming", "no GPS")
+    )
+    assert assert_failed(outcome).reason.endswith("no GPS")
     assert harness.guidance.phase == "idle"
     assert not harness.autopilot.setpoints
 
 
 def test_endless_step_succeeds_at_its_timeout() -> None:
-    _, behaviour, outcome = flown({"do": "orbit radius=5", "timeout_s": 4}, {"do": "hold 0.5"})
+    _, behaviour, outcome = flown({"do": "orbit radius=5", "timeout_s": 4}, "hold 0.5")
     assert_succeeded(outcome)
     assert "4 s" in behaviour.records[0].reason
 
@@ -211,7 +197,7 @@ def test_visits_limit_ends_a_loop() -> None:
 
 def test_loop_of_steps_that_fail_at_once_ends() -> None:
     harness = GuidanceHarness(flying())
-    behaviour = mission(harness, {"do": "hold 0.2"}, {"do": "seek car", "name": "look", "on_failure": "look"})
+    behaviour = mission(harness, "hold 0.2", {"do": "seek car", "name": "look", "on_failure": "look"})
     pending = begun(harness, behaviour)
     harness.perception_age_s = None
     outcome = harness.outcome(pending)
@@ -226,32 +212,29 @@ def test_mission_timeout_ends_the_current_step() -> None:
 @pytest.mark.parametrize("mode", [FlightMode.POSITION, FlightMode.HOLD, FlightMode.RETURN])
 def test_pilot_ends_the_mission_at_any_step(mode: FlightMode) -> None:
     harness = GuidanceHarness(flying())
-    behaviour = mission(
-        harness, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), {"do": "land"}
-    )
+    behaviour = mission(harness, *({"do": "hold 0.1", "on_failure": "continue"} for _ in range(30)), "land")
     future = begun(harness, behaviour)
     harness.until(lambda: len(behaviour.records) >= 3)
     harness.autopilot.change_mode(mode)
     harness.until(future.done, 2.0)
-    sent, active = len(harness.autopilot.setpoints), len(behaviour.records)
+    active = len(behaviour.records)
     ended = behaviour.with_step(future.result())
     assert ended.reason.startswith("step ")
     assert "pilot" in ended.reason
     # OFFBOARD that comes back by itself does not restore our command.
     harness.autopilot.change_mode(FlightMode.OFFBOARD)
-    harness.run(5.0)
-    assert len(harness.autopilot.setpoints) == sent
+    assert harness.silent(5.0)
     assert len(behaviour.records) == active
     assert not harness.guidance.in_command
 
 
 def test_new_command_ends_the_mission_at_once() -> None:
     harness = GuidanceHarness(flying())
-    behaviour = mission(harness, {"do": "hold 5", "on_failure": "land"}, {"do": "land"})
+    behaviour = mission(harness, {"do": "hold 5", "on_failure": "land"}, "land")
     future = begun(harness, behaviour)
     harness.until(lambda: harness.guidance.phase == "offboard")
     harness.run(1.0)
-    harness.command(HoldBehaviour())
+    harness.command("hold")
     reason = behaviour.with_step(future.result()).reason
     assert reason.startswith("step 1 of 2 (hold duration=5): replaced ")
     assert reason.endswith(" hold")

@@ -248,3 +248,14 @@ def test_an_attitude_that_stands_still_while_turning_ages() -> None:
     assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.3, 1.0), 20).attitude_ns == 10
     assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.3, 0.0), 20).attitude_ns == 20
     assert apply_message(state, "ATTITUDE_QUATERNION", turned(0.31, 1.0), 20).attitude_ns == 20
+
+
+def test_both_battery_messages_set_the_stamp() -> None:
+    state = apply_message(VehicleState(), "BATTERY_STATUS", {"id": 0, "battery_remaining": 40}, 5)
+    assert (state.battery_fraction, state.battery_ns) == (0.4, 5)
+    sensors = {"onboard_control_sensors_present": 0, "onboard_control_sensors_health": 0}
+    fields = {**sensors, "battery_remaining": 39}
+    state = apply_message(state, "SYS_STATUS", fields, 9)
+    assert (state.battery_fraction, state.battery_ns) == (0.39, 9)
+    unknown = apply_message(state, "BATTERY_STATUS", {"id": 0, "battery_remaining": -1}, 20)
+    assert unknown.battery_ns == 9
