@@ -23,7 +23,7 @@ from companion.vehicle.state import VehicleState
 from vision.attitude import quaternion_from_euler
 from vision.camera_model import CameraModel, CameraMount
 from vision.detections import DetectionRecord
-from vision.geolocation import DEPTH_OF_WIDTH, ErrorEllipse, position_covariance
+from vision.geolocation import DEPTH_OF_WIDTH
 from vision.rotation import matrix_from_quaternion
 
 CAMERA = CameraModel.from_horizontal_fov(1280, 960, math.radians(80))
@@ -222,11 +222,3 @@ def test_two_thirds_of_the_errors_are_within_one_sigma(
         assert abs(float(np.median(each))) < 0.15
     assert true_m.min() < 5.0
     assert true_m.max() > 50.0
-
-
-def test_ellipse_lies_along_the_line_of_sight() -> None:
-    for bearing_deg in (10.0, 80.0, 135.0, -120.0):
-        ellipse = ErrorEllipse.of(position_covariance(math.radians(bearing_deg), 2.0, 0.5))
-        assert ellipse.semi_major_m == pytest.approx(2.0)
-        assert ellipse.semi_minor_m == pytest.approx(0.5)
-        assert math.degrees(ellipse.orientation_rad) == pytest.approx(bearing_deg % 180.0)
