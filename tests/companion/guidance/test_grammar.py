@@ -1,3 +1,4 @@
+import json
 import math
 from dataclasses import fields
 
@@ -24,7 +25,7 @@ from companion.guidance import (
     Takeoff,
 )
 from companion.guidance.command import COMMANDS, NO_CONTEXT, Command, GrammarError, arguments_of
-from companion.guidance.grammar import describe, parse
+from companion.guidance.grammar import describe, json_schema, parse
 from companion.guidance.objects.tracked_object import Subject
 
 NAMES = ("person", "bicycle", "car", "truck", "boat", "dog", "chair", "traffic light", "fire_hydrant")
@@ -304,3 +305,22 @@ def test_every_field_is_an_argument_of_the_grammar() -> None:
 @pytest.mark.parametrize("text", ["hold", "hold 5", "orbit", "orbit laps=2", "land", "figure-eight laps=0"])
 def test_endless_commands(text: str) -> None:
     assert parse(text).endless is (text in ("hold", "orbit", "figure-eight laps=0"))
+
+
+def test_schema_has_every_command_and_its_ranges() -> None:
+    schema = json_schema(["car", "dog"])
+    json.dumps(schema)
+    assert set(schema["$defs"]) == set(COMMANDS)
+    approach = schema["$defs"]["approach"]
+    assert schema["$defs"]["seek"]["required"] == ["class"]
+    assert approach["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}, {"required": ["marker"]}]
+    assert approach["properties"]["class"]["enum"] == ["car", "dog"]
+    distance = approach["properties"]["distance"]
+    assert "nearest surface" in distance.pop("description")
+    assert distance == {
+        "type": "number",
+        "minimum": 1.0,
+        "maximum": 100.0,
+        "unit": "m",
+        "default": 5.0,
+    }

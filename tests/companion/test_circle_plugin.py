@@ -13,7 +13,7 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.guidance.command import COMMANDS
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "circle"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "circle"
 
 
 def installed_package(example: Path, folder: Path) -> Path:

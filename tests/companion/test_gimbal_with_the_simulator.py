@@ -9,7 +9,7 @@ import pytest
 
 from companion.vehicle.gimbal import NOBODY, GimbalState
 from mavlink_sim.testing import running_simulator
-from tests.companion.guidance.guidance_harness import assert_failed
+from tests.companion.guidance.guidance_harness import assert_failed, known
 from tests.companion.live_flight import STATION, LiveFlight, ground_station
 from tests.companion.service_process import TWICE
 from vision.detections import Detections
@@ -33,13 +33,11 @@ class FlightWithGimbal(LiveFlight):
     def gimbal(self) -> GimbalState:
         """The reported state."""
         gimbal = self.driver.state.gimbal
-        assert gimbal is not None
-        return gimbal
+        return known(gimbal)
 
     @property
     def pitch_deg(self) -> float:
-        assert self.gimbal.pitch_rad is not None
-        return math.degrees(self.gimbal.pitch_rad)
+        return math.degrees(known(self.gimbal.pitch_rad))
 
 
 async def test_sweep_gimbal_command_and_station_takeover() -> None:
@@ -83,7 +81,6 @@ async def test_sweep_gimbal_command_and_station_takeover() -> None:
             configures(-3, -3)
             await service.until(lambda: service.gimbal.primary_control == NOBODY)
             assert (await service.fly("gimbal pitch=0")).success
-            assert guidance.behaviour is not None
-            assert guidance.behaviour.name == "hold", "the behaviour goes on"
+            assert known(guidance.behaviour).name == "hold", "the behaviour goes on"
             # PX4 takes the gimbal at a landing, points it ahead and releases it.
             assert (await service.fly("land")).success

@@ -1,8 +1,7 @@
-"""Registration of commands, including those of plug-ins."""
+"""Plug-ins: what they register, and how one that cannot be loaded is named."""
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -111,22 +110,3 @@ def test_plugin_that_cannot_be_loaded_is_named(
     assert "\n" not in str(error.value)
     # A traceback helps where the plug-in's own code fails.
     assert [record.exc_info is not None for record in caplog.records] == [True] * traced
-
-
-def test_schema_has_every_command_and_its_ranges() -> None:
-    schema = json_schema(["car", "dog"])
-    json.dumps(schema)
-    assert set(schema["$defs"]) == set(COMMANDS)
-    approach = schema["$defs"]["approach"]
-    assert schema["$defs"]["seek"]["required"] == ["class"]
-    assert approach["oneOf"] == [{"required": ["class"]}, {"required": ["track"]}, {"required": ["marker"]}]
-    assert approach["properties"]["class"]["enum"] == ["car", "dog"]
-    distance = approach["properties"]["distance"]
-    assert "nearest surface" in distance.pop("description")
-    assert distance == {
-        "type": "number",
-        "minimum": 1.0,
-        "maximum": 100.0,
-        "unit": "m",
-        "default": 5.0,
-    }

@@ -23,10 +23,10 @@ from companion.guidance.grammar import json_schema, parse, usage
 from companion.guidance.objects.tracked_object import Subject
 from companion.plugins import load_plugins
 from mavlink_sim.lockstep import LockstepVehicle
-from tests.companion.guidance.test_circle_plugin import installed_package
+from tests.companion.test_circle_plugin import installed_package
 from vision.camera_model import CameraModel, CameraMount
 
-EXAMPLE = Path(__file__).parents[3] / "examples" / "circle_object"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "circle_object"
 CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(80.0))
 MOUNT = CameraMount(forward_m=0.1, pitch_rad=math.radians(-22.0), stabilized=True)
 SIZES_M = {"car": (4.2, 1.8, 1.5), "person": (0.5, 0.6, 1.7)}

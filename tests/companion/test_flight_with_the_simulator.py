@@ -25,15 +25,13 @@ def choose_mode(station: Any, main: int, sub: int) -> None:
 
 def speed_mps(state: VehicleState) -> float:
     """Horizontal speed."""
-    assert state.velocity_ned_mps is not None
-    return math.hypot(*state.velocity_ned_mps[:2])
+    return math.hypot(*known(state.velocity_ned_mps)[:2])
 
 
 def off_m(state: VehicleState, north_m: float, east_m: float) -> float:
     """Horizontal distance from a point that is given from home."""
     home, here = known(state.home_position_ned_m), state.position_ned_m
-    assert here is not None
-    return math.dist(here[:2], (home[0] + north_m, home[1] + east_m))
+    return math.dist(known(here)[:2], (home[0] + north_m, home[1] + east_m))
 
 
 @pytest.mark.parametrize("kind", ["pymavlink", pytest.param("mavsdk", marks=pytest.mark.slow)])

@@ -11,7 +11,7 @@ import pytest
 from companion.guidance.behaviour import Outcome
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.testing import vehicle
-from tests.companion.guidance.guidance_harness import assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_succeeded, known
 from tests.companion.live_flight import LiveFlight, ground_station
 
 pytestmark = pytest.mark.realtime
@@ -21,8 +21,7 @@ LOITER, GUIDED = 5, 4
 
 def speed_mps(state: VehicleState) -> float:
     """Horizontal speed."""
-    assert state.velocity_ned_mps is not None
-    return math.hypot(*state.velocity_ned_mps[:2])
+    return math.hypot(*known(state.velocity_ned_mps)[:2])
 
 
 async def test_flight_until_the_pilot_takes_over_ardupilot() -> None:
