@@ -16,7 +16,7 @@ from companion.vehicle.streamer import StreamState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.wire.messages import dialect
 from mavlink_sim.wire.setpoints import velocity_setpoint
-from tests.companion.guidance.guidance_harness import assert_failed, in_the_air
+from tests.companion.guidance.guidance_harness import assert_failed, in_the_air, known
 
 STATION = (255, 190)
 PAUSE, CONTINUE = 0.0, 1.0
@@ -123,8 +123,7 @@ def test_setpoints_beside_ours_are_noticed(
     assert flight.state.foreign_setpoint is None
     assert flight.run_until(lambda: flight.state.foreign_setpoint, within_s)
     found = flight.state.foreign_setpoint
-    assert found is not None
-    assert found.followed.startswith("north 1.00 m/s")
+    assert known(found).followed.startswith("north 1.00 m/s")
 
 
 FLIGHT = (

@@ -113,16 +113,19 @@ def assert_arrived(outcome: Outcome, hold: list[Moment], goal: Vector3, name: st
     assert max(off_m) <= at_most_m
 
 
+def somewhere(seed: int) -> Goto:
+    chance = random.Random(seed)
+    goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
+    return Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0)
+
+
 @pytest.mark.parametrize(("name", "seed"), FLIGHTS)
 def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     flight = LockstepFlight.airborne(**air(name, seed))
-    chance = random.Random(seed)
-    goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
-    goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
-    height_m = known(goto._command.altitude_m)
-    home = known(flight.state.home_position_ned_m)
-    outcome, hold = then_hold(flight, goto)
-    assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] - height_m), name)
+    goto, home = somewhere(seed), known(flight.state.home_position_ned_m)
+    outcome, hold = then_hold(flight, GotoBehaviour(goto))
+    goal = (known(goto.north_m), known(goto.east_m), -known(goto.altitude_m))
+    assert_arrived(outcome, hold, (home[0] + goal[0], home[1] + goal[1], home[2] + goal[2]), name)
 
 
 # The worst of 50, the worst one of them always.
@@ -130,12 +133,10 @@ def test_goto_arrives_and_hold_keeps_its_goal(name: str, seed: int) -> None:
     "seed", [20, *(pytest.param(n, marks=pytest.mark.slow) for n in (22, 41, 16, 19, 34))]
 )
 def test_hold_stays_within_0_3_m_in_gusts(seed: int) -> None:
-    chance = random.Random(seed)
-    goal = (chance.uniform(-15.0, 15.0), chance.uniform(-15.0, 15.0))
-    goto = GotoBehaviour(Goto(*goal, altitude_m=chance.uniform(3.0, 8.0), speed_mps=4.0))
-    outcome, hold = then_hold(LockstepFlight.airborne(**air("px4", seed)), goto)
-    assert outcome.goal_ned_m is not None
-    assert max(math.dist(m.context.state.position_ned_m or (), outcome.goal_ned_m) for m in hold) <= 0.3
+    outcome, hold = then_hold(LockstepFlight.airborne(**air("px4", seed)), GotoBehaviour(somewhere(seed)))
+    assert (
+        max(math.dist(m.context.state.position_ned_m or (), known(outcome.goal_ned_m)) for m in hold) <= 0.3
+    )
 
 
 @pytest.mark.parametrize(

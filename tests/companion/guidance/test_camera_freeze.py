@@ -19,15 +19,13 @@ from companion.bench.synthetic_camera import Detect, SyntheticCamera
 from companion.bench.synthetic_detector import Faults, SceneObject, ScenePose, SyntheticDetector
 from companion.guidance.behaviour import Outcome
 from companion.guidance.interface import GuidanceInput
-from companion.guidance.missions.mission_file import plan_from
-from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight, object_detections
 from companion.guidance.objects.table import ObjectTable
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
-from tests.companion.guidance.guidance_harness import assert_failed, in_the_air, known
+from tests.companion.guidance.guidance_harness import assert_failed, in_the_air, known, mission
 from tests.companion.guidance.test_marker_target import pad_detection
 from vision.attitude import Quaternion
 from vision.camera_model import CameraModel, CameraMount
@@ -108,17 +106,32 @@ def person_at(north_m: float, east_m: float = 0.0) -> SceneObject:
     return SceneObject("person", (0.5, 0.6, 1.7), lambda _: ScenePose(north_m, east_m))
 
 
+def seeing(
+    *persons: SceneObject,
+    mount: CameraMount = MOUNT,
+    seed: int = 1,
+    also: Callable[[Detect], Detect] = lambda detect: detect,
+    tracker: TrackerSettings | None = TrackerSettings(),  # noqa: B008 - frozen
+) -> LockstepFlight:
+    """In the air, nose to the north, with a detector that misses nothing: a frozen image shows the person.
+
+    Args:
+        also: adds to the detections.
+    """
+    seen = Faults(missed=0.0, false_per_frame=0.0)
+    detector = SyntheticDetector(persons, CAMERA, mount, seed=seed, faults=seen)
+    camera = SyntheticCamera(camera_settings(CAMERA, mount), detect=also(detector), tracker=tracker)
+    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    flight.turn_to(0.0)
+    return flight
+
+
 def frozen(command: str, fault: str, seed: int, *, stabilized: bool = False) -> Freeze:
     """A flight to a person, with a freeze at a random time of it."""
     rng = random.Random(seed)
     person = person_at(rng.uniform(10.0, 14.0), rng.uniform(-1.0, 1.0))
     mount = CameraMount(forward_m=0.1, pitch_rad=MOUNT.pitch_rad, stabilized=stabilized)
-    # The frozen image must show the person, else there is no object.
-    seen = Faults(missed=0.0, false_per_frame=0.0)
-    detector = SyntheticDetector([person], CAMERA, mount, seed=seed, faults=seen)
-    camera = SyntheticCamera(camera_settings(CAMERA, mount), detect=detector)
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
-    flight.turn_to(0.0)
+    flight = seeing(person, mount=mount, seed=seed)
     freeze = Freeze(flight, fault, rng.uniform(1.0, 6.0), lambda place: person.range_m(place, 0.0))
     return freeze.fly(command)
 
@@ -145,27 +158,20 @@ def test_mission_approaches_two_persons_of_one_class(tracker: TrackerSettings | 
     # The seconds count from the command, before it from the start.
     begun: list[LockstepFlight] = []
     near = replace(person_at(14.0), hidden=lambda seconds: bool(begun) and seconds > first_s - 0.5)
-    seen = Faults(missed=0.0, false_per_frame=0.0)
-    detector = SyntheticDetector([near, person_at(22.0, -1.0)], CAMERA, MOUNT, seed=1, faults=seen)
-    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector, tracker=tracker)
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
-    flight.turn_to(0.0)
-    approach = f'[[step]]\ndo = "approach person distance={DISTANCE_M:g} speed={SPEED_MPS:g} retries=0"\n'
-    text = f"{approach}timeout_s = {first_s}\non_failure = 'continue'\n{approach}"
-    mission = SequenceBehaviour(plan_from(text, "test.toml"), flight.guidance.check_requirements)
-    assert flight.fly(mission, 60.0, on_tick=lambda: begun.append(flight)).outcome is not None
-    assert [record.success for record in mission.records] == [False, True], [
-        r.reason for r in mission.records
-    ]
+    flight = seeing(near, person_at(22.0, -1.0), tracker=tracker)
+    first = {"do": BEHAVIOURS["approach"], "timeout_s": first_s, "on_failure": "continue"}
+    both = mission(flight, first, BEHAVIOURS["approach"])
+    assert flight.fly(both, 60.0, on_tick=lambda: begun.append(flight)).outcome is not None
+    assert [record.success for record in both.records] == [False, True], both.records
     assert not any("camera frozen" in event.message for event in flight.events)
 
 
-def with_gear(detect: Detect | None = None) -> Detect:
+def with_gear(detect: Detect) -> Detect:
     """Detections, and a landing gear that is always at the same pixels."""
     gear = np.array([[40.25, 380.5, 120.75, 460.25]], np.float32)
 
     def seen(position: Vector3, attitude: Quaternion, seconds: float) -> Detections:
-        found = Detections.empty(("person",)) if detect is None else detect(position, attitude, seconds)
+        found = detect(position, attitude, seconds)
         return Detections(
             np.vstack((found.xyxy, gear)),
             np.append(found.confidence, np.float32(0.8)),
@@ -179,8 +185,7 @@ def with_gear(detect: Detect | None = None) -> Detect:
 @pytest.mark.parametrize("tracker", [TrackerSettings(), None], ids=["tracks", "no tracks"])
 @pytest.mark.parametrize("command", ["goto 20 0 speed=5", "patrol 0,0 15,0 classes=person laps=1"])
 def test_a_landing_gear_in_view_is_no_frozen_camera(command: str, tracker: TrackerSettings | None) -> None:
-    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=with_gear(), tracker=tracker)
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
+    flight = seeing(also=with_gear, tracker=tracker)
     outcome = known(flight.fly(command, 60.0).outcome)
     assert not any("camera frozen" in event.message for event in flight.events)
     assert outcome.success, outcome
@@ -188,11 +193,7 @@ def test_a_landing_gear_in_view_is_no_frozen_camera(command: str, tracker: Track
 
 @pytest.mark.parametrize("fault", [EXACT, BELOW_A_CLOCK])
 def test_a_frozen_camera_with_a_landing_gear_in_view_is_found(fault: str) -> None:
-    seen = Faults(missed=0.0, false_per_frame=0.0)
-    detector = SyntheticDetector([person_at(12.0)], CAMERA, MOUNT, seed=1, faults=seen)
-    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=with_gear(detector))
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
-    flight.turn_to(0.0)
+    flight = seeing(person_at(12.0), also=with_gear)
     freeze = Freeze(flight, fault, 2.0).fly(BEHAVIOURS["follow"])
     assert freeze.named
     assert freeze.flown_m <= MAX_FLOWN_M[fault], freeze
@@ -204,11 +205,7 @@ def test_a_frozen_camera_leaves_the_markers_of_another(shared: bool) -> None:
     below = MarkerSight((marker,), fresh=True, missing="")
     table, here = ObjectTable(), (0.0, 0.0, -3.0)
     objects = table.update(object_detections([marker], here), here, marker.captured_ns)
-    seen = Faults(missed=0.0, false_per_frame=0.0)
-    detector = SyntheticDetector([person_at(12.0)], CAMERA, MOUNT, seed=1, faults=seen)
-    camera = SyntheticCamera(camera_settings(CAMERA, MOUNT), detect=detector)
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=3.0, wind_mps=1.0), camera=camera)
-    flight.turn_to(0.0)
+    flight = seeing(person_at(12.0))
     assemble = flight.inputs.assemble
 
     def with_markers(*given: Any, **named: Any) -> GuidanceInput:
@@ -281,8 +278,7 @@ def test_no_landing_sinks_on_with_a_frozen_camera(fault: str, target: str, seed:
         f"land-on-marker {flights_land.MIDDLE} target={target} attempts=1"
     )
     # It sinks at 0.8 m/s for a second, or for 1.5 m or two sigma and two blocks of frames, and then climbs.
-    assert freeze.place is not None
-    assert freeze.lowest_m >= -freeze.place[2] - (1.3 if fault == EXACT else 3.3), freeze
+    assert freeze.lowest_m >= -known(freeze.place)[2] - (1.3 if fault == EXACT else 3.3), freeze
     assert freeze.lowest_m > 0.5, freeze
     assert_failed(freeze.outcome)
     assert fault == BELOW_A_CLOCK or freeze.named, freeze

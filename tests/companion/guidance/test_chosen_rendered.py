@@ -12,7 +12,7 @@ from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
 from mavlink_sim.lockstep import LockstepVehicle
-from tests.companion.guidance.guidance_harness import assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_succeeded, known
 from vision.camera_model import CameraModel, CameraMount
 from vision.tracking import SelectRequest
 
@@ -49,8 +49,7 @@ class Flight:
 
     def box_of(self, index: int) -> tuple[float, float, float, float]:
         """An object's true rectangle in the newest frame: left, top, width, height as fractions."""
-        assert self.camera.shown is not None
-        (xyxy,) = [o.xyxy for o in self.camera.shown.objects if o.world_object.identifier == index]
+        (xyxy,) = [o.xyxy for o in known(self.camera.shown).objects if o.world_object.identifier == index]
         left, top, right, bottom = xyxy
         return (
             left / CAMERA.width,
@@ -66,8 +65,7 @@ class Flight:
         self.flight.run(0.5)
         (target,) = [t for t in self.flight.inputs.steering.targets if t.class_name == "target"]
         assert target.track_id not in before
-        assert target.track_id is not None
-        return target.track_id
+        return known(target.track_id)
 
     def range_m(self, index: int) -> float:
         return self.objects[index].range_m(self.flight.vehicle.truth.position_ned_m, self.flight.seconds)
@@ -80,8 +78,7 @@ def test_follow_by_track_keeps_to_the_farther_of_two_cars() -> None:
     farther = max(cars, key=lambda target: target.ground_range_m)
     assert len(cars) == 2
     log = seen.flight.fly(f"follow track={farther.track_id} distance=13", 20.0)
-    assert log.outcome is not None
-    assert log.outcome.reason == "in progress"
+    assert known(log.outcome).reason == "in progress"
     seen.flight.run(4.0)
     assert seen.flight.guidance.busy
     assert seen.range_m(1) == pytest.approx(13.0, abs=0.8)

@@ -48,8 +48,7 @@ def test_goal_keeps_its_ground_position_through_a_reset(autopilot: str, reset_s:
 
     def arrived() -> bool:
         nonlocal fastest_mps
-        assert flight.state.velocity_ned_mps is not None
-        fastest_mps = max(fastest_mps, math.hypot(*flight.state.velocity_ned_mps[:2]))
+        fastest_mps = max(fastest_mps, math.hypot(*known(flight.state.velocity_ned_mps)[:2]))
         return flight.outcome(identifier) is not None
 
     assert flight.run_until(arrived, 40.0)

@@ -1,12 +1,10 @@
 """Reasons of a loss of command: autopilot failsafe or pilot."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
-from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.interface import GuidanceInput
 from companion.guidance.mode_control import REASON_WAIT_S
 from companion.vehicle.report import Report
@@ -24,6 +22,7 @@ from tests.companion.guidance.guidance_harness import (
 
 SOON = {"COM_FAIL_ACT_T": 0.0}
 FENCE = {"GF_MAX_HOR_DIST": 10.0}
+LASTING = "commander_failsafe_enter_generic"
 BREACH = "Geofence violation: exceeding maximum distance to Home"
 
 
@@ -63,15 +62,6 @@ def test_px4_failsafe_has_its_cause_and_is_left_to_px4(
     assert flight.vehicle.vehicle.autopilot.mode is later
 
 
-def test_other_mode_change_is_reported_as_pilot() -> None:
-    flight = LockstepFlight.of_vehicle(in_the_air(seed=4))
-    identifier = flight.command("goto 30 0")
-    flight.run(3.0)
-    flight.vehicle.vehicle.autopilot.set_mode(Mode.HOLD)
-    flight.run(2.0)
-    assert_failed(flight.outcome(identifier), "pilot", "hold mode")
-
-
 @pytest.mark.parametrize(
     ("intended", "who"),
     [
@@ -99,84 +89,60 @@ def test_heartbeat_first_stops_stream_and_waits_for_reason(
         )
 
     harness = GuidanceHarness(flying(), inputs=modify)
-    future = engaged(harness, OrbitBehaviour(Orbit()))
+    future = engaged(harness, "orbit")
     harness.autopilot.change_mode(FlightMode.RETURN)
     changed_ns.append(harness.vehicle.now_ns)
     harness.run()
-    sent = len(harness.autopilot.setpoints)
-    harness.run(max(late_s, STEP_S))
+    assert harness.silent(max(late_s, STEP_S))
     if late_s > REASON_WAIT_S:  # never reported: not requested by us
         who = "pilot took over"
     assert_failed(future.result(), who, "return mode")
-    assert len(harness.autopilot.setpoints) == sent
     harness.autopilot.change_mode(FlightMode.OFFBOARD)
-    harness.run(2.0)
-    assert len(harness.autopilot.setpoints) == sent
+    assert harness.silent(2.0)
 
 
-def failsafe_inputs(name: str, text: str) -> Callable[[GuidanceInput], GuidanceInput]:
-    """A PX4 failsafe that shows HOLD, and its event."""
-
-    def modify(inputs: GuidanceInput) -> GuidanceInput:
-        state = inputs.state
-        offboard = FlightMode.OFFBOARD
-        reports: tuple[Report, ...] = (Report(state.heartbeat_ns - 5_000_000_000, 4, "Low battery"),)
-        if state.mode is FlightMode.HOLD:
-            reports += (
-                Report(state.heartbeat_ns, 3, "No manual control input", "arming_check", modes=0b111),
-                Report(state.heartbeat_ns, 2, text, "default", name),
-            )
-        changed = replace(state, intended_mode=offboard, intended_beside=state.mode, reports=reports)
-        return replace(inputs, state=changed)
-
-    return modify
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "asks"),
-    [
-        ("commander_failsafe_enter_generic", "Failsafe activated: switching to Hold", ["hold"]),
-        ("commander_failsafe_enter_generic_hold", "Failsafe activated: switching to RTL in 5 seconds", []),
-    ],
-)
-def test_lasting_hold_is_confirmed_one_before_rtl_is_not(name: str, text: str, asks: list[str]) -> None:
-    """PX4 leaves its hold for a return when setpoints stop, unless hold was requested last."""
-    harness = GuidanceHarness(flying(), inputs=failsafe_inputs(name, text))
-    future = harness.command(OrbitBehaviour(Orbit(radius_m=5.0)))
-    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
-    harness.run(0.2)
-    harness.autopilot.requests.clear()
-    harness.autopilot.change_mode(FlightMode.HOLD)
-    harness.run(0.1)
-    assert_failed(future.result(), "autopilot failsafe", "hold mode", text)
-    harness.run(3.0)
-    assert harness.autopilot.requests == asks
-    assert not harness.guidance.in_command
-
-
-@pytest.mark.parametrize("late_s", [0.1, 0.25])
-def test_hold_is_confirmed_when_its_event_comes_late(late_s: float) -> None:
-    """PX4 reports the cause first; the event of the failsafe may come later."""
+def failsafe_in_hold(name: str, text: str, late_s: float) -> GuidanceHarness:
+    """OFFBOARD ends in a failsafe that shows HOLD. PX4 reports the cause first; its event may come later."""
     changed_ns: list[int] = []
 
     def modify(inputs: GuidanceInput) -> GuidanceInput:
         state = inputs.state
-        reports: tuple[Report, ...] = (Report(state.heartbeat_ns, 4, "Geofence violation", "arming_check"),)
-        if changed_ns and harness.vehicle.now_ns - changed_ns[0] >= late_s * 1e9:
-            name = "commander_failsafe_enter_generic"
-            reports += (Report(changed_ns[0], 2, "Failsafe activated: switching to Hold", "default", name),)
+        reports: tuple[Report, ...] = (Report(state.heartbeat_ns - 5_000_000_000, 4, "Low battery"),)
+        if state.mode is FlightMode.HOLD and changed_ns:
+            reports += (
+                Report(state.heartbeat_ns, 3, "No manual control input", "arming_check", modes=0b111),
+            )
+            if state.heartbeat_ns - changed_ns[0] >= late_s * 1e9:
+                reports += (Report(changed_ns[0], 2, text, "default", name),)
         changed = replace(
             state, intended_mode=FlightMode.OFFBOARD, intended_beside=state.mode, reports=reports
         )
         return replace(inputs, state=changed)
 
     harness = GuidanceHarness(flying(), inputs=modify)
-    harness.command(OrbitBehaviour(Orbit(radius_m=5.0)))
-    harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
-    harness.run(0.2)
+    pending = engaged(harness, "orbit radius=5")
     harness.autopilot.requests.clear()
-    changed_ns.append(harness.vehicle.now_ns)
     harness.autopilot.change_mode(FlightMode.HOLD)
-    harness.run(1.0)
-    assert harness.autopilot.requests == ["hold"]
+    changed_ns.append(harness.vehicle.now_ns)
+    harness.run(late_s + 0.1)
+    words = [text] if late_s == 0.0 else []
+    assert_failed(pending.result(), "autopilot failsafe", "hold mode", *words)
+    harness.run(3.0)
     assert not harness.guidance.in_command
+    return harness
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "late_s", "asks"),
+    [
+        (LASTING, "Failsafe activated: switching to Hold", 0.0, ["hold"]),
+        (LASTING, "Failsafe activated: switching to Hold", 0.1, ["hold"]),
+        (LASTING, "Failsafe activated: switching to Hold", 0.25, ["hold"]),
+        (f"{LASTING}_hold", "Failsafe activated: switching to RTL in 5 seconds", 0.0, []),
+    ],
+)
+def test_lasting_hold_is_confirmed_one_before_rtl_is_not(
+    name: str, text: str, late_s: float, asks: list[str]
+) -> None:
+    """PX4 leaves its hold for a return when setpoints stop, unless hold was requested last."""
+    assert failsafe_in_hold(name, text, late_s).autopilot.requests == asks

@@ -63,8 +63,7 @@ def separated(fleet: Fleet) -> bool:
 def slots(fleet: Fleet, name: str) -> dict[str, int]:
     behaviour = fleet.members[name].behaviour
     assert isinstance(behaviour, FormationBehaviour)
-    assert behaviour.note is not None
-    return dict(behaviour.note.slots)
+    return dict(known(behaviour.note).slots)
 
 
 def ended(fleet: Fleet, name: str) -> Outcome:
@@ -185,8 +184,7 @@ def test_followers_hold_without_leader_and_resume() -> None:
         member = fleet.members[name]
         velocity = known(member.airframe.state.velocity_ned_mps)
         assert math.hypot(*velocity) < 0.5
-        assert member.behaviour is not None
-        assert "leader a" in member.behaviour.status
+        assert "leader a" in known(member.behaviour).status
     fleet.members["a"].muted = False
     assert fleet.run_until(lambda: settled(fleet, "bc", 1.2), 40.0)
     fleet.members["a"].muted = True

@@ -7,7 +7,6 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
-from companion.guidance.objects.tracked_object import Subject
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
@@ -32,7 +31,7 @@ class AfterGoal(Behaviour):
 
 def test_hold_keeps_its_initial_position_and_heading() -> None:
     vehicle = KinematicVehicle(position=[3.0, -2.0, -6.0], yaw_rad=1.2)
-    flight = Flight(HoldBehaviour(), vehicle)
+    flight = Flight("hold", vehicle)
     assert flight.run(5.0) is None
     assert math.dist(vehicle.position, (3.0, -2.0, -6.0)) < 0.01
     first = flight.steps[0]
@@ -53,7 +52,7 @@ def test_hold_keeps_the_previous_goal_if_near(goal: Vector3, held: bool) -> None
 
 def test_hold_brakes_first_and_does_not_fly_back() -> None:
     vehicle = KinematicVehicle(velocity=[4.0, 0.0, 0.0])
-    flight = Flight(HoldBehaviour(), vehicle)
+    flight = Flight("hold", vehicle)
     flight.run(8.0)
     furthest = max(position[0] for position in flight.track)
     assert vehicle.position[0] > 0.5
@@ -62,7 +61,7 @@ def test_hold_brakes_first_and_does_not_fly_back() -> None:
 
 
 def test_hold_ends_after_its_duration() -> None:
-    assert_succeeded(Flight(HoldBehaviour(duration_s=2.0)).run(3.0), "2 s")
+    assert_succeeded(Flight("hold 2").run(3.0), "2 s")
 
 
 @pytest.mark.parametrize("direction", ["clockwise", "counterclockwise"])
@@ -98,7 +97,7 @@ def test_orbit_flies_its_laps_facing_the_centre(direction: str) -> None:
 def test_orbit_reaches_a_distant_circle() -> None:
     car = SeenObject("car", 30.0, 4.0)
     vehicle = KinematicVehicle()
-    flight = Flight(OrbitBehaviour(Orbit(Subject("car"), 8.0, 3.0, 1.0)), vehicle, [car])
+    flight = Flight("orbit car radius=8 speed=3 laps=1", vehicle, [car])
     # The behaviour begins after the first frame, as its requirement demands.
     flight.latency_s = 0.0
     assert_succeeded(flight.run(90.0))
@@ -106,7 +105,7 @@ def test_orbit_reaches_a_distant_circle() -> None:
 
 
 def test_orbit_without_a_visible_object_ends() -> None:
-    assert_failed(Flight(OrbitBehaviour(Orbit(subject=Subject("boat")))).run(5.0), "boat")
+    assert_failed(Flight("orbit boat").run(5.0), "boat")
 
 
 def test_orbit_at_its_centre_gives_finite_setpoints() -> None:

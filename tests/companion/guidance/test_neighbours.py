@@ -20,6 +20,7 @@ from companion.guidance.formation.pose import Pose
 from companion.guidance.requirements import check_requirements
 from companion.vehicle.global_position import Anchor
 from companion.vehicle.state import Vector3, VehicleState
+from tests.companion.guidance.guidance_harness import known
 from tests.companion.guidance.test_pose import NOW_NS, STATE
 
 SECOND = 10**9
@@ -50,8 +51,7 @@ def state_at(now_ns: int) -> VehicleState:
 
 def alpha_of(neighbours: Neighbours, now_ns: int) -> Neighbour:
     alpha = neighbours.neighbourhood(state_at(now_ns), now_ns).named("alpha")
-    assert alpha is not None
-    return alpha
+    return known(alpha)
 
 
 @given(

@@ -15,13 +15,12 @@ import pytest
 from companion.bench.lockstep_flight import LockstepFlight, plain_settings
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.guidance.interface import Request, SetMode
-from companion.guidance.missions.mission_file import plan_from
-from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
 from companion.service.guidance_loop import mode_at_shutdown
 from companion.vehicle.state import FlightMode, VehicleState
 from mavlink_sim.lockstep import LockstepVehicle
 from mavlink_sim.px4.modes import Mode
+from tests.companion.guidance.guidance_harness import mission
 
 EVERY_S = 0.05
 # A change of the mode is not reported sooner after another one. What ours overrides meanwhile, nobody knows.
@@ -84,8 +83,7 @@ def by(text: str) -> Callable[[LockstepFlight], None]:
 
 
 def start_mission(flight: LockstepFlight) -> None:
-    text = '[[step]]\ndo = "hold 0.5"\n[[step]]\ndo = "land"\n'
-    flight.command(SequenceBehaviour(plan_from(text, "test.toml"), flight.guidance.check_requirements))
+    flight.command(mission(flight, "hold 0.5", "land"))
 
 
 def end_soon(flight: LockstepFlight) -> None:

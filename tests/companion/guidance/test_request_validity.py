@@ -8,10 +8,8 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.command import NO_CONTEXT
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
-from companion.guidance.grammar import parse
 from companion.guidance.interface import (
     COMMAND_VALID_S,
     REQUEST_VALID_S,
@@ -23,32 +21,35 @@ from companion.guidance.interface import (
     TakeOff,
 )
 from companion.guidance.limits.battery import BatteryMinimum
-from companion.guidance.missions.mission_file import plan_from
-from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.vehicle.state import FlightMode
-from tests.companion.guidance.guidance_harness import GuidanceHarness, ScriptedGimbal, flying, parked
+from tests.companion.guidance.guidance_harness import (
+    GuidanceHarness,
+    ScriptedGimbal,
+    built,
+    flying,
+    hovering,
+    mission,
+    parked,
+    standing,
+    with_state,
+)
 
 WAITED_S = 3.0
 
 
-def no_home(inputs: GuidanceInput) -> GuidanceInput:
-    return replace(inputs, state=replace(inputs.state, home_position_ned_m=None, home_altitude_amsl_m=None))
-
-
-def no_gimbal(inputs: GuidanceInput) -> GuidanceInput:
-    return replace(inputs, state=replace(inputs.state, gimbal=None))
-
-
-def checks_run(inputs: GuidanceInput) -> GuidanceInput:
-    return replace(inputs, state=replace(inputs.state, ready_to_arm=False))
+no_home = with_state(home_position_ned_m=None, home_altitude_amsl_m=None)
+checks_run = with_state(ready_to_arm=False)
 
 
 def no_frame(inputs: GuidanceInput) -> GuidanceInput:
     return replace(inputs, seen_ns=None)
 
 
-def give(harness: GuidanceHarness, behaviour: Behaviour, received_ns: int) -> None:
+def give(harness: GuidanceHarness, command: Behaviour | str, before_s: float = 0.0) -> int:
+    """A command that was received so long ago; returns when."""
+    behaviour, received_ns = built(command), harness.now_ns - round(before_s * 1e9)
     harness.step(CommandInput(1, behaviour.name, behaviour, received_ns=received_ns))
+    return received_ns
 
 
 def starts(harness: GuidanceHarness) -> list[tuple[int, Request]]:
@@ -81,8 +82,7 @@ def test_waits_count_from_the_command_on(
 ) -> None:
     harness = GuidanceHarness(parked() if on_ground else flying(), lag_s=0.4, inputs=missing)
     harness.run(before_s + 0.5)
-    received_ns = harness.now_ns - round(before_s * 1e9)
-    give(harness, parse(text).build(NO_CONTEXT), received_ns)
+    received_ns = give(harness, text, before_s)
     harness.run(seconds)
     assert starts(harness) == []
     harness._inputs = lambda inputs: inputs
@@ -94,10 +94,8 @@ def test_waits_count_from_the_command_on(
 
 
 def test_last_request_of_a_takeoff_is_as_old_as_its_command() -> None:
-    harness = GuidanceHarness(parked(), lag_s=2.5, inputs=no_home)  # a mode shows late
-    harness.run(0.5)
-    received_ns = harness.now_ns
-    give(harness, parse("takeoff 4").build(NO_CONTEXT), received_ns)
+    harness = standing(lag_s=2.5, inputs=no_home)  # a mode shows late
+    received_ns = give(harness, "takeoff 4")
     harness.run(WAITED_S)
     harness._inputs = checks_run
     harness.until(lambda: any(isinstance(request.action, TakeOff) for _, request in starts(harness)), 20.0)
@@ -108,11 +106,9 @@ def test_last_request_of_a_takeoff_is_as_old_as_its_command() -> None:
 
 def test_gimbal_is_waited_for_within_the_validity() -> None:
     mounting = GimbalMounting(carries_camera=True, carries_steering=True)
-    harness = GuidanceHarness(flying(), options=GuidanceOptions(gimbal=mounting), inputs=no_gimbal)
+    harness = hovering(options=GuidanceOptions(gimbal=mounting), inputs=with_state(gimbal=None))
     harness.autopilot.gimbal = ScriptedGimbal()
-    harness.run(0.5)
-    received_ns = harness.now_ns - 5_000_000_000
-    give(harness, parse("seek car sweep=-60").build(NO_CONTEXT), received_ns)
+    received_ns = give(harness, "seek car sweep=-60", 5.0)
     harness.run(WAITED_S)
     assert starts(harness) == []
     harness._inputs = lambda inputs: inputs
@@ -122,12 +118,8 @@ def test_gimbal_is_waited_for_within_the_validity() -> None:
 
 
 def test_later_steps_count_from_their_own_decision() -> None:
-    harness = GuidanceHarness(parked(), lag_s=0.4)
-    harness.run(0.5)
-    text = "".join(f'[[step]]\ndo = "{step}"\n' for step in ("takeoff 3", "hold 10", "land", "takeoff 3"))
-    plan = plan_from(text, "test.toml")
-    received_ns = harness.now_ns
-    give(harness, SequenceBehaviour(plan, harness.guidance.check_requirements), received_ns)
+    harness = standing(lag_s=0.4)
+    received_ns = give(harness, mission(harness, "takeoff 3", "hold 10", "land", "takeoff 3"))
     decided: list[tuple[int, Request]] = []
 
     def second_takeoff() -> bool:
@@ -147,11 +139,9 @@ def test_later_steps_count_from_their_own_decision() -> None:
 @pytest.mark.parametrize("streaming", [True, False])
 def test_low_battery_action_is_not_as_old_as_the_command(streaming: bool) -> None:
     options = GuidanceOptions(battery=BatteryMinimum(0.2, "land"))
-    harness = GuidanceHarness(flying(), lag_s=0.4, options=options)
-    harness.run(0.5)
-    received_ns = harness.now_ns - round((COMMAND_VALID_S - 1.0) * 1e9)
+    harness = hovering(lag_s=0.4, options=options)
     harness.streaming = streaming  # without it OFFBOARD is not requested yet
-    give(harness, parse("hold").build(NO_CONTEXT), received_ns)
+    received_ns = give(harness, "hold", COMMAND_VALID_S - 1.0)
     harness.autopilot.battery_fraction = 0.1
     harness.until(lambda: "land" in harness.autopilot.requests, 10.0)
     requests = [request for output in harness.outputs for request in output.requests]

@@ -113,8 +113,7 @@ def harness_with_gimbal(**changes: Any) -> GuidanceHarness:
 def test_lost_gimbal_control_ends_seek_with_the_owner() -> None:
     harness = harness_with_gimbal()
     command = engaged(harness, seek())
-    assert harness.autopilot.gimbal is not None
-    harness.autopilot.gimbal.primary = (245, 190)
+    known(harness.autopilot.gimbal).primary = (245, 190)
     assert_failed(harness.outcome(command, 1.0), "lost the gimbal", "245/190")
 
 
@@ -123,8 +122,7 @@ def test_previous_gimbal_problem_does_not_end_the_next(behaviour: Behaviour) -> 
     """A behaviour begins in the step in which the previous one is replaced."""
     harness = harness_with_gimbal(refuses="denied")
     engaged(harness, KeepsAim())
-    assert harness.autopilot.gimbal is not None
-    harness.autopilot.gimbal.refuses = None
+    known(harness.autopilot.gimbal).refuses = None
     assert harness.guidance.gimbal.problem(harness.vehicle.now_ns, harness.autopilot.state) == "denied"
     command = harness.command(behaviour)
     harness.run(3.0)
@@ -141,8 +139,7 @@ def test_stuck_gimbal_ends_seek() -> None:
 def test_silent_gimbal_ends_seek_with_the_reason() -> None:
     harness = harness_with_gimbal()
     command = engaged(harness, seek())
-    assert harness.autopilot.gimbal is not None
-    harness.autopilot.gimbal.reports_attitude = False
+    known(harness.autopilot.gimbal).reports_attitude = False
     outcome = harness.outcome(command)
     assert_failed(outcome, "camera direction unknown", "attitude 5.")
     assert outcome.reason.endswith("s old) for 5 s")
@@ -162,8 +159,7 @@ def test_cleared_gimbal_attitude_ends_the_sweep(left: GimbalState | None, ended:
     harness = harness_with_gimbal()
     command = engaged(harness, behaviour)
     harness.until(lambda: bool(behaviour._failure) is ended, 20.0)  # after a failure the gimbal returns
-    assert harness.autopilot.gimbal is not None
-    vars(harness.autopilot.gimbal)["state"] = lambda now_ns: left
+    vars(known(harness.autopilot.gimbal))["state"] = lambda now_ns: left
     reason = "gimbal manager not responding"
     if left is not None:
         reason = f"seek lost the gimbal: {left.why_not_looking(NOW_NS) or '?'}"
@@ -197,8 +193,7 @@ def test_sweep_covers_every_direction_during_the_turn(end_deg: float, rate_dps: 
     while len(ends) < 6:
         moving.step(0.05, pitch_rad)
         seconds += 0.05
-        assert moving.aim is not None
-        pitch_rad = moving.aim.pitch_rad
+        pitch_rad = known(moving.aim).pitch_rad
         if abs(pitch_rad - goal) < 1e-6:
             ends.append(seconds)
             goal = 0.0 if goal else moving.end_rad

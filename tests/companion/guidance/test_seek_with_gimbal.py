@@ -16,8 +16,6 @@ from companion.bench.lockstep_flight import FlightLog, LockstepFlight, Moment
 from companion.bench.synthetic_detector import SceneObject
 from companion.guidance.command import BuildContext
 from companion.guidance.grammar import parse
-from companion.guidance.missions.mission_file import plan_from
-from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.objects.target import Target
 from tests.companion.guidance.gimbal_flight import (
     CAMERA,
@@ -27,7 +25,13 @@ from tests.companion.guidance.gimbal_flight import (
     gimbal_flight,
     person,
 )
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, in_the_air, known
+from tests.companion.guidance.guidance_harness import (
+    assert_failed,
+    assert_succeeded,
+    in_the_air,
+    known,
+    mission,
+)
 
 # Bounds of the combined errors of image, gimbal and estimator.
 DIRECTION_BOUND_RAD, PLACE_BOUND_M = math.radians(1.5), 0.6
@@ -69,8 +73,7 @@ def pitches(log: FlightLog) -> list[float]:
     found = []
     for moment in log.moments:
         gimbal = known(moment.context.state.gimbal)
-        assert gimbal.pitch_rad is not None
-        found.append(math.degrees(gimbal.pitch_rad))
+        found.append(math.degrees(known(gimbal.pitch_rad)))
     return found
 
 
@@ -94,13 +97,12 @@ def test_sweep_finds_an_object_nearly_below(bearing_deg: float) -> None:
 
 
 def test_mission_step_holds_until_the_gimbal_points_there() -> None:
-    table = '[[step]]\ndo = "gimbal pitch=-50"\n[[step]]\ndo = "hold duration=1"\n'
-    mission = SequenceBehaviour(plan_from(table, "looks"), lambda behaviour: None)
     flight = LockstepFlight.of_vehicle(in_the_air(seed=5, height_m=HEIGHT_M, gimbal=True))
-    log = flight.fly(mission, 20.0)
+    steps = mission(flight, "gimbal pitch=-50", "hold duration=1")
+    log = flight.fly(steps, 20.0)
     assert_succeeded(log.outcome)
-    assert [step.success for step in mission.records] == [True, True]
-    assert "50° down" in mission.records[0].reason
+    assert [step.success for step in steps.records] == [True, True]
+    assert "50° down" in steps.records[0].reason
     assert pitches(log)[-1] == pytest.approx(-50.0, abs=3.0)
     # The next step does not use it, so control was released.
     manager = known(flight.vehicle.vehicle.gimbal_manager)

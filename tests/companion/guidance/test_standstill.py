@@ -6,21 +6,10 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import VelocityInput
-from companion.guidance.behaviours.approach import Approach, ApproachBehaviour
-from companion.guidance.behaviours.goto import Goto, GotoBehaviour
-from companion.guidance.behaviours.hold import HoldBehaviour
-from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.behaviours.stop import StopBehaviour
-from companion.guidance.behaviours.takeoff import TakeoffBehaviour
-from companion.guidance.command import NO_CONTEXT
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.gimbal.controller import GimbalMounting
-from companion.guidance.grammar import parse
-from companion.guidance.interface import CommandInput, EventKind, GuidanceInput
-from companion.guidance.missions.mission_file import plan_from
-from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.guidance.objects.tracked_object import Subject
+from companion.guidance.interface import EventKind, GuidanceInput
 from companion.vehicle.state import FlightMode, LandedState
 from companion.vehicle.vehicle_type import VtolState
 from tests.companion.guidance.guidance_harness import (
@@ -28,8 +17,10 @@ from tests.companion.guidance.guidance_harness import (
     ScriptedGimbal,
     assert_failed,
     engaged,
-    flying,
-    parked,
+    hovering,
+    mission,
+    standing,
+    with_state,
 )
 
 LEADER = Neighbour("alpha", (20.0, 0.0, -5.0), (0.0, 0.0, 0.0), 0.0, 0.0, age_s=0.1)
@@ -41,22 +32,18 @@ def with_leader(inputs: GuidanceInput) -> GuidanceInput:
 
 
 def on_ground() -> GuidanceHarness:
-    harness = GuidanceHarness(parked(), lag_s=0.4)
-    harness.run(0.5)
-    return harness
+    return standing(lag_s=0.4)
 
 
 def in_flight() -> GuidanceHarness:
-    harness = GuidanceHarness(flying(), lag_s=0.2, inputs=with_leader)
-    harness.run(0.3)
-    return harness
+    return hovering(lag_s=0.2, inputs=with_leader)
 
 
 def _before_arming() -> GuidanceHarness:
     """The pre-arm checks still run."""
     harness = on_ground()
-    harness._inputs = lambda inputs: replace(inputs, state=replace(inputs.state, ready_to_arm=False))
-    harness.command(TakeoffBehaviour(4.0))
+    harness._inputs = with_state(ready_to_arm=False)
+    harness.command("takeoff 4")
     harness.run(0.5)
     assert harness.autopilot.requests == []
     return harness
@@ -64,7 +51,7 @@ def _before_arming() -> GuidanceHarness:
 
 def _while_arming() -> GuidanceHarness:
     harness = on_ground()
-    harness.command(TakeoffBehaviour(4.0))
+    harness.command("takeoff 4")
     assert harness.autopilot.requests == ["arm"]
     return harness
 
@@ -77,7 +64,7 @@ def _after_arming() -> GuidanceHarness:
 
 def _in_the_climb() -> GuidanceHarness:
     harness = on_ground()
-    harness.command(TakeoffBehaviour(4.0))
+    harness.command("takeoff 4")
     harness.until(lambda: harness.vehicle.position[2] < -1.0)
     return harness
 
@@ -86,14 +73,14 @@ def _end_of_the_climb() -> GuidanceHarness:
     """A short take-off is finished by setpoints, about to be requested."""
     harness = on_ground()
     harness.autopilot.takeoff_short_m = 0.7
-    harness.command(TakeoffBehaviour(4.0))
+    harness.command("takeoff 4")
     harness.until(lambda: harness.vehicle.landed is LandedState.IN_AIR)
     return harness
 
 
 def _engaging() -> GuidanceHarness:
     harness = in_flight()
-    harness.command(HoldBehaviour())
+    harness.command("hold")
     harness.run()
     return harness
 
@@ -101,7 +88,7 @@ def _engaging() -> GuidanceHarness:
 def _flown(text: str) -> Callable[[], GuidanceHarness]:
     def made() -> GuidanceHarness:
         harness = in_flight()
-        harness.command(parse(text).build(NO_CONTEXT))
+        harness.command(text)
         harness.until(lambda: harness.guidance.phase == "offboard")
         harness.run(0.5)
         return harness
@@ -111,7 +98,7 @@ def _flown(text: str) -> Callable[[], GuidanceHarness]:
 
 def _hold_between_commands() -> GuidanceHarness:
     harness = in_flight()
-    harness.outcome(harness.command(HoldBehaviour(0.2)))
+    harness.outcome(harness.command("hold 0.2"))
     assert harness.guidance.phase == "offboard"
     return harness
 
@@ -119,9 +106,7 @@ def _hold_between_commands() -> GuidanceHarness:
 def _mission(*steps: str, at: str) -> Callable[[], GuidanceHarness]:
     def made() -> GuidanceHarness:
         harness = on_ground()
-        text = "".join(f'[[step]]\ndo = "{step}"\non_failure = "continue"\n' for step in steps)
-        plan = plan_from(text, "test.toml")
-        harness.command(SequenceBehaviour(plan, harness.guidance.check_requirements))
+        harness.command(mission(harness, *steps, each={"on_failure": "continue"}))
         runner = harness.guidance.runner
         harness.until(lambda: runner.active is not None and runner.active.name == at)
         harness.run(0.3)
@@ -132,11 +117,8 @@ def _mission(*steps: str, at: str) -> Callable[[], GuidanceHarness]:
 
 def _waiting_for_the_gimbal() -> GuidanceHarness:
     mounting = GimbalMounting(carries_camera=True, carries_steering=True)
-    harness = GuidanceHarness(
-        flying(), lag_s=0.2, inputs=with_leader, options=GuidanceOptions(gimbal=mounting)
-    )
-    harness.run(0.3)
-    harness.command(parse("seek car sweep=-60").build(NO_CONTEXT))
+    harness = hovering(lag_s=0.2, inputs=with_leader, options=GuidanceOptions(gimbal=mounting))
+    harness.command("seek car sweep=-60")
     assert not harness.guidance.in_command
     return harness
 
@@ -180,7 +162,7 @@ STARTS = {"arm", "offboard", "takeoff 3", "takeoff 4", "mission", "takeoff"}
 def test_nothing_starts_after_a_standstill(phase: str, seconds: float, suspended: bool) -> None:
     harness = PHASES[phase]()
     harness.stand_still(seconds, suspended=suspended)
-    requests, setpoints = len(harness.autopilot.requests), len(harness.autopilot.setpoints)
+    requests = len(harness.autopilot.requests)
     active = harness.guidance.behaviour
     harness._inputs = with_leader
     harness.autopilot.gimbal = ScriptedGimbal()
@@ -189,19 +171,18 @@ def test_nothing_starts_after_a_standstill(phase: str, seconds: float, suspended
         assert active is None or harness.guidance.behaviour is active  # too short to matter
         return
     # What was sent to a suspended computer may arrive as late as the suspend was long.
-    harness.run(max(20.0, seconds + 1.0) if suspended else 20.0)
+    assert harness.silent(max(20.0, seconds + 1.0) if suspended else 20.0)
     assert not STARTS & set(harness.autopilot.requests[requests:])
-    assert len(harness.autopilot.setpoints) == setpoints
     assert not harness.guidance.in_command
     # The operator's next command flies.
     if harness.vehicle.landed is LandedState.IN_AIR:
-        engaged(harness, HoldBehaviour())
-        assert len(harness.autopilot.setpoints) > setpoints
+        engaged(harness)
+        assert not harness.silent(0.1)
 
 
 def test_end_of_the_command_names_the_suspend() -> None:
     harness = in_flight()
-    pending = harness.command(GotoBehaviour(Goto(north_m=50.0, east_m=0.0)))
+    pending = harness.command("goto north=50 east=0")
     harness.until(lambda: harness.guidance.phase == "offboard")
     harness.stand_still(42.0, suspended=True)
     harness.run()
@@ -213,23 +194,21 @@ def test_end_of_the_command_names_the_suspend() -> None:
 def test_command_that_waited_in_a_buffer_is_refused(suspended: bool) -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=suspended)
-    first = harness.command(HoldBehaviour())  # read before guidance's first step
+    first = harness.command("hold")  # read before guidance's first step
     assert not first.result().success
     # TCP sends again what a suspended computer has not received, as long after it as that lasted.
     late_s = 30.0 if suspended else 1.0
     harness.run(late_s - 0.5)
-    assert not harness.command(HoldBehaviour()).result().success
+    assert not harness.command("hold").result().success
     harness.run(1.0)
-    assert not harness.command(HoldBehaviour()).done()
+    assert not harness.command("hold").done()
 
 
-@pytest.mark.parametrize("behaviour", [StopBehaviour, LandBehaviour, ReturnBehaviour])
-def test_commands_that_end_a_flight_are_not_refused(
-    behaviour: type[StopBehaviour] | type[LandBehaviour],
-) -> None:
+@pytest.mark.parametrize("command", ["stop", "land", "rtl"])
+def test_commands_that_end_a_flight_are_not_refused(command: str) -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=True)
-    assert not harness.command(behaviour()).done()
+    assert not harness.command(command).done()
 
 
 class SilentUntilReceived:
@@ -243,14 +222,14 @@ class SilentUntilReceived:
 
 
 @pytest.mark.parametrize("mode", [FlightMode.OFFBOARD, FlightMode.RETURN])
-@pytest.mark.parametrize("behaviour", [StopBehaviour, LandBehaviour, ReturnBehaviour])
+@pytest.mark.parametrize(("command", "request_"), [("stop", "hold"), ("land", "land"), ("rtl", "return")])
 def test_commands_that_end_a_flight_wait_for_a_heartbeat(
-    behaviour: type[StopBehaviour] | type[LandBehaviour], mode: FlightMode
+    command: str, request_: str, mode: FlightMode
 ) -> None:
     harness = _flown("goto 60 0")()
     harness.stand_still(4.0, suspended=True)
     harness._inputs = silent = SilentUntilReceived()
-    pending = harness.command(behaviour())
+    pending = harness.command(command)
     harness.run(0.9)
     assert not pending.done()
     # PX4 has left OFFBOARD meanwhile: the heartbeat shows a mode that was chosen before the command.
@@ -259,31 +238,28 @@ def test_commands_that_end_a_flight_wait_for_a_heartbeat(
     assert not pending.done()
     silent.received = True
     assert harness.outcome(pending).success
-    assert harness.autopilot.requests[-1] == {"land": "land", "rtl": "return", "stop": "hold"}[behaviour.name]
+    assert harness.autopilot.requests[-1] == request_
 
 
 def test_commands_that_end_a_flight_wait_for_the_vtol_state() -> None:
     harness = _flown("goto 60 0")()
     harness.stand_still(4.0, suspended=True)
-    vtol_states: list[VtolState | None] = [None]
-    harness._inputs = lambda inputs: replace(
-        inputs, state=replace(inputs.state, mav_type=22, mav_autopilot=12, vtol_state=vtol_states[-1])
-    )
-    pending = harness.command(StopBehaviour())
+    harness._inputs = with_state(mav_type=22, mav_autopilot=12, vtol_state=None)
+    pending = harness.command("stop")
     harness.run(0.9)
     assert not pending.done()
-    vtol_states.append(VtolState.MC)
+    harness._inputs = with_state(mav_type=22, mav_autopilot=12, vtol_state=VtolState.MC)
     assert harness.outcome(pending).success
 
 
-@pytest.mark.parametrize("newer", [HoldBehaviour, StopBehaviour])
-def test_command_without_a_heartbeat_is_answered(newer: type[HoldBehaviour] | type[StopBehaviour]) -> None:
+@pytest.mark.parametrize("newer", ["hold", "stop"])
+def test_command_without_a_heartbeat_is_answered(newer: str) -> None:
     harness = _flown("goto 60 0")()
     harness.stand_still(1.0, suspended=True)
     harness._inputs = SilentUntilReceived()
-    pending = harness.command(StopBehaviour())
+    pending = harness.command("stop")
     harness.run(1.1)  # until then only commands that end a flight are accepted
-    second = harness.command(newer())
+    second = harness.command(newer)
     assert "superseded" in pending.result().reason
     harness.run(5.0)
     assert "no link" in second.result().reason
@@ -301,13 +277,12 @@ def test_track_from_before_a_suspend_is_forgotten() -> None:
     harness = in_flight()
     harness.stand_still(30.0, suspended=True)
     harness.run(1.1)
-    assert_failed(harness.command(ApproachBehaviour(Approach(Subject(track_id=7)))).result())
+    assert_failed(harness.command("approach track=7").result())
 
 
 def test_waiting_command_is_answered_after_a_standstill() -> None:
     harness = in_flight()
-    seek = parse("seek car sweep=-60").build(NO_CONTEXT)
-    harness.step(CommandInput(99, "seek", seek))
+    pending = harness.command("seek car sweep=-60")
     harness.stand_still(1.0, suspended=True)
     harness.step()
-    assert not harness.results[99].success
+    assert_failed(pending.result())

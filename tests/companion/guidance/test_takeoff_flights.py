@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -28,10 +29,15 @@ def on_ground(px4: str | None = None, *, seed: int = 9, **parameters: float) -> 
     return flight
 
 
-def test_takeoff_that_px4_ends_early_reaches_its_height() -> None:
-    flight = on_ground(NAV_MC_ALT_RAD=1.6)  # 1.3 m short
-    assert_succeeded(flight.fly("takeoff 6", 90.0).outcome)
-    assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
+@pytest.mark.parametrize(
+    ("height_m", "parameters"),
+    [(6.0, {"NAV_MC_ALT_RAD": 1.6}), (2.5, {})],
+    ids=["PX4 ends it 1.3 m short", "2.5 m"],
+)
+def test_takeoff_reaches_its_height(height_m: float, parameters: dict[str, Any]) -> None:
+    flight = on_ground(**parameters)
+    assert_succeeded(flight.fly(f"takeoff {height_m}", 90.0).outcome)
+    assert flight.state.altitude_m == pytest.approx(height_m, abs=0.3)
 
 
 def pilot_selects(flight: LockstepFlight, auto_mode: int) -> None:
@@ -82,21 +88,21 @@ def test_hold_in_mid_takeoff_ends_the_command(
     assert flight.state.mode is FlightMode.HOLD
 
 
-def test_hold_just_outside_the_acceptance_is_a_pilots() -> None:
+@pytest.mark.parametrize(
+    ("hold_m", "least_m", "most_m", "pilots"), [(4.6, 1.3, 1.45, True), (4.75, 1.1, 1.3, False)]
+)
+def test_hold_outside_the_acceptance_alone_is_a_pilots(
+    hold_m: float, least_m: float, most_m: float, pilots: bool
+) -> None:
     flight = on_ground()
-    short_m, outcome = held_in_climb(flight, 6.0, 4.6)
-    assert 1.3 < short_m < 1.45
-    assert not outcome.success
-    assert outcome.reason == PILOT
-    assert flight.state.mode is FlightMode.HOLD
-
-
-def test_hold_just_inside_the_acceptance_is_px4s() -> None:
-    flight = on_ground()
-    short_m, outcome = held_in_climb(flight, 6.0, 4.75)
-    assert 1.1 < short_m < 1.3
-    assert outcome.success, outcome.reason
-    assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
+    short_m, outcome = held_in_climb(flight, 6.0, hold_m)
+    assert least_m < short_m < most_m
+    if pilots:
+        assert outcome == Outcome(False, PILOT)
+        assert flight.state.mode is FlightMode.HOLD
+    else:
+        assert_succeeded(outcome)
+        assert flight.state.altitude_m == pytest.approx(6.0, abs=0.3)
 
 
 @pytest.mark.parametrize(
@@ -121,12 +127,6 @@ def test_pilot_stops_the_rest_of_a_takeoff(after: FlightMode, auto_mode: int, sh
     assert outcome.reason.endswith(f": {shown.value} mode")
     flight.run(3.0)
     assert flight.state.mode is shown
-
-
-def test_takeoff_of_2_5_m_reaches_its_height() -> None:
-    flight = on_ground()
-    assert_succeeded(flight.fly("takeoff 2.5", 60.0).outcome)
-    assert flight.state.altitude_m == pytest.approx(2.5, abs=0.3)
 
 
 @pytest.mark.parametrize("px4", ["1.17", *(pytest.param(name, marks=pytest.mark.slow) for name in OLDER)])

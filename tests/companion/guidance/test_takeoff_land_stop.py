@@ -10,7 +10,6 @@ from companion.guidance.behaviour import BehaviourContext, ModeRequest, Outcome
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
-from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
 from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
 from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle
@@ -48,50 +47,10 @@ def test_takeoff_requests_the_mode_until_near_the_height() -> None:
     assert "4.8 m" in outcome.reason
 
 
-def test_takeoff_completes_a_short_climb() -> None:
-    behaviour = TakeoffBehaviour(2.5)
-    behaviour.on_activate(context(0))
-    short = climbing(2.1, FlightMode.HOLD, LandedState.IN_AIR)
-    assert isinstance(behaviour.update(0.02, context(5.0, **short)), ModeRequest)
-    assert isinstance(behaviour.update(0.02, context(5.9, **short)), ModeRequest)
-    step = behaviour.update(0.02, context(6.1, **short))
-    assert isinstance(step, Setpoint)
-    assert step.velocity_ned_mps is not None
-    assert step.velocity_ned_mps[2] < -0.3
-    risen = climbing(2.3, FlightMode.OFFBOARD, LandedState.IN_AIR)
-    assert isinstance(behaviour.update(0.02, context(8.0, **risen)), Setpoint)
-    outcome = behaviour.update(0.02, context(8.5, **risen))
-    assert isinstance(outcome, Outcome)
-    assert (outcome.success, outcome.goal_ned_m) == (True, (0.0, 0.0, -2.5))
-    assert "2.3 m" in outcome.reason
-
-
 def test_takeoff_times_out_with_the_height_reached() -> None:
     behaviour = TakeoffBehaviour(5.0)
     behaviour.on_activate(context(0))
     assert_failed(behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF)), "0.0 m of 5 m")
-
-
-@pytest.mark.parametrize(
-    ("kind", "mode"),
-    [
-        (LandBehaviour, FlightMode.LAND),
-        (ReturnBehaviour, FlightMode.RETURN),
-    ],
-)
-def test_land_and_rtl_end_when_disarmed(
-    kind: type[LandBehaviour] | type[ReturnBehaviour], mode: FlightMode
-) -> None:
-    behaviour = kind()
-    behaviour.on_activate(context(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR)))
-    assert behaviour.update(
-        0.0, context(0, **climbing(5.0, FlightMode.HOLD, LandedState.IN_AIR))
-    ) == ModeRequest(mode)
-    touched: dict[str, Any] = {"armed": True, "mode": mode, "landed": LandedState.ON_GROUND}
-    assert behaviour.update(0.02, context(9, **touched)) == ModeRequest(mode)
-    # After disarming PX4 shows the mode from before the landing.
-    outcome = assert_succeeded(behaviour.update(0.02, context(11, mode=FlightMode.OFFBOARD)), "landed ")
-    assert outcome.reason.endswith(" and disarmed")
 
 
 LANDING = replace(PARKED, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR, heartbeat_ns=START_NS)

@@ -7,10 +7,8 @@ from dataclasses import replace
 import pytest
 
 from companion.guidance.behaviour import Behaviour
-from companion.guidance.behaviours.goto import Goto, GotoBehaviour
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
-from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import EventKind, GuidanceInput
@@ -69,7 +67,7 @@ def test_no_flight_command_begins(behaviour: Behaviour, identity: Identity) -> N
 @pytest.mark.parametrize("identity", NOT_FLOWN)
 def test_change_of_type_ends_our_command_at_once(identity: Identity) -> None:
     harness = Vehicle(HOVERING)
-    pending = engaged(harness, OrbitBehaviour(Orbit()))
+    pending = engaged(harness, "orbit")
     requests, sent = list(harness.autopilot.requests), len(harness.autopilot.setpoints)
     harness.identity = identity
     harness.run()
@@ -89,7 +87,7 @@ def test_change_of_type_ends_our_command_at_once(identity: Identity) -> None:
 @pytest.mark.parametrize("identity", NOT_FLOWN)
 def test_type_that_changes_while_landing_ends_the_command(identity: Identity) -> None:
     harness = Vehicle(HOVERING)
-    pending = harness.command(LandBehaviour())
+    pending = harness.command("land")
     harness.run(0.5)
     harness.identity = identity
     assert_failed(harness.outcome(pending, 1.0), "vehicle")
@@ -98,5 +96,5 @@ def test_type_that_changes_while_landing_ends_the_command(identity: Identity) ->
 
 def test_hovering_vtol_of_px4_flies_like_a_multicopter() -> None:
     harness = Vehicle(HOVERING)
-    engaged(harness, HoldBehaviour())
-    assert harness.outcome(harness.command(GotoBehaviour(Goto(forward_m=2.0, right_m=0.0))), 30.0).success
+    engaged(harness)
+    assert harness.outcome(harness.command("goto forward=2 right=0"), 30.0).success
