@@ -23,6 +23,8 @@ def test_follow_keeps_its_distance_through_an_occlusion(bearing: str) -> None:
     flight, outcome = flown(f"follow car distance=8 bearing={bearing}", moving(3.0, 18.0, 19.5), seconds=30.0)
     assert outcome is None
     assert flight.distance_m() == pytest.approx(8.0, abs=0.8)
+    assert flight.behaviour.status.startswith("following the car")
+    assert flight.behaviour.status.endswith(" m away")
 
 
 OTHER = SeenObject("car", 20.0, 4.0, track_id=2, track_score=0.9)

@@ -1,4 +1,4 @@
-"""Plug-ins: what they register, and how one that cannot be loaded is named."""
+"""Registration of commands by plug-ins, and how one that cannot be loaded is named."""
 
 from __future__ import annotations
 
