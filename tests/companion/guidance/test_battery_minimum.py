@@ -43,7 +43,7 @@ LOW = "14%; guidance.min_battery_percent"
     [
         *((command, 0.15, 0.14, LOW) for command in ("hold", "orbit", "takeoff")),
         ("hold", 0.15, None, "not received"),
-        # What flies no farther needs none.
+        # Commands that end a flight need none.
         *((command, 0.15, 0.01, "") for command in ("land", "rtl", "stop")),
         ("hold", 0.0, None, ""),
     ],

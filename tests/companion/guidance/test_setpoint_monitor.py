@@ -74,7 +74,7 @@ def constant(*velocity: float) -> Velocity:
     return lambda seconds: (velocity[0], velocity[1], velocity[2])
 
 
-# What was flown for 5 s, then what is commanded and what is flown, and within which seconds that is noticed.
+# The first 5 s, then setpoint and velocity, and within which seconds the difference is noticed.
 NOTICED: dict[str, tuple[Velocity | None, Velocity, Velocity, float, float]] = {
     "stopped at 1 m/s": (north(1.0), north(1.0), stopping(1.0), 2.5, 3.1),
     "stopped at 2 m/s": (north(2.0), north(2.0), stopping(2.0), 1.0, 1.9),
@@ -104,7 +104,7 @@ def early(seconds: float) -> Vector3:
     return (-math.sin(1.9 * seconds), math.cos(1.9 * seconds), 0.0)
 
 
-# What is commanded and flown, and the residual at most.
+# Setpoint and velocity, and the residual at most.
 FOLLOWING: dict[str, tuple[Velocity, Velocity, float]] = {
     "0.3 m/s slower": (north(0.3), still, 0.4),
     "PX4's slow rise to 3 m/s in its SIH simulation": (north(3.0), rising(2.65, 1.2), 0.5),
