@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 
@@ -11,7 +10,7 @@ from benchmarks.rendered import camera_settings
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.guidance.interface import EventKind, GuidanceInput
+from companion.guidance.interface import EventKind
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     assert_failed,
@@ -20,6 +19,7 @@ from tests.companion.guidance.guidance_harness import (
     flying,
     in_the_air,
     known,
+    with_state,
 )
 from vision.camera_model import CameraModel, CameraMount
 
@@ -110,14 +110,9 @@ def test_invalid_position_without_gps_is_not_used(autopilot: str) -> None:
 
 def test_invalid_estimate_brakes_and_then_ends_command() -> None:
     """With an autopilot that stays in offboard mode."""
-
-    def invalid(inputs: GuidanceInput) -> GuidanceInput:
-        return replace(inputs, state=replace(inputs.state, position_valid=not lost))
-
-    lost = False
-    harness = GuidanceHarness(flying(), inputs=invalid)
+    harness = GuidanceHarness(flying())
     pending = engaged(harness)
-    lost = True
+    harness._inputs = with_state(position_valid=False)
     harness.run(0.5)
     assert not pending.done()
     setpoint = known(harness.outputs[-1].setpoint)

@@ -12,25 +12,15 @@ from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import DOUBTED, Target
 from companion.guidance.objects.tracked_object import Subject
 from tests.companion.guidance.guidance_harness import known
+from tests.companion.guidance.one_object import seen_car
 
 HERE = (0.0, 0.0, -4.0)
 CAR, TRACK = Subject("car"), Subject(track_id=1)
 
 
 def car(north: float, east: float = 0.0, track_id: int = 1, **more: Any) -> Target:
-    seen = Target(
-        "car",
-        0.9,
-        0,
-        0.1 * east,
-        -0.3,
-        north,
-        position_ned_m=(north, east, 0.0),
-        track_id=track_id,
-        range_sigma_m=0.2,
-        across_sigma_m=0.1,
-    )
-    return replace(seen, **more)
+    sigmas = {"range_sigma_m": 0.2, "across_sigma_m": 0.1}
+    return replace(seen_car((north, east), vehicle=HERE, track_id=track_id), **(sigmas | more))
 
 
 class Scene:
