@@ -205,7 +205,9 @@ def test_object_that_leaves_the_image_keeps_its_position(shown: str) -> None:
         leaving = max(frame - 20, 0)
         east = 0.2 * leaving + (2.0 if shown == "with another part" and leaving > 10 else 0.0)
         by_bearing = shown == "by its bearing alone" and leaving > 0
-        unranged: dict[str, Any] = {"position_ned_m": None, "range_source": RangeSource.NONE} if by_bearing else {}
+        unranged: dict[str, Any] = (
+            {"position_ned_m": None, "range_source": RangeSource.NONE} if by_bearing else {}
+        )
         fused.sees(12.0, east, sigma_m=0.5, cut=leaving > 0, **unranged)
         assert not fused.now.occluded
     assert fused.place == pytest.approx((12.0, 0.0))
