@@ -20,7 +20,8 @@ CAR, TRACK = Subject("car"), Subject(track_id=1)
 
 def car(north: float, east: float = 0.0, track_id: int = 1, **more: Any) -> Target:
     sigmas = {"range_sigma_m": 0.2, "across_sigma_m": 0.1}
-    return replace(seen_car((north, east), vehicle=HERE, track_id=track_id), **(sigmas | more))
+    seen = seen_car((north, east), vehicle=HERE, captured_ns=0, track_id=track_id)
+    return replace(seen, **(sigmas | more))
 
 
 class Scene:
