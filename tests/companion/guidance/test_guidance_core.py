@@ -32,6 +32,7 @@ from tests.companion.guidance.guidance_harness import (
 def test_setpoints_are_sent_before_offboard_is_requested(lag_s: float) -> None:
     harness = hovering(lag_s=lag_s)
     harness.command("hold")
+    assert harness.guidance.status.endswith("engaging offboard")
     harness.until(lambda: "offboard" in harness.autopilot.requests, 5.0)
     assert len(harness.autopilot.setpoints) >= 2
     harness.until(lambda: harness.guidance.phase == "offboard", 5.0)
@@ -98,6 +99,7 @@ def test_command_that_ends_the_flight_hands_over_silently(command: str, lag_s: f
     assert harness.autopilot.state.armed is (command == "stop")
     assert harness.silent(2.0)
     assert not harness.guidance.in_command
+    assert harness.guidance.status == "not in command"
     assert EventKind.LOST not in kinds(harness)
 
 

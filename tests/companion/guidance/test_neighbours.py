@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 
@@ -9,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.bus.vehicle_messages import pose_message
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Requirement
 from companion.guidance.formation.neighbours import (
     Neighbour,
@@ -64,7 +66,7 @@ def test_global_conversion_round_trip(latitude: float, longitude: float, positio
 
 def test_different_local_origins_are_supported() -> None:
     neighbours = Neighbours("beta")
-    neighbours.ingest(pose(0), NOW_NS)
+    neighbours.on_message(json.dumps(pose_message(pose(0))).encode(), NOW_NS)
     # The own local origin differs: this vehicle is at (1, 2, -5).
     alpha = alpha_of(neighbours, NOW_NS)
     assert alpha.position_ned_m == pytest.approx((11.0, 2.0, -5.0), abs=0.02)

@@ -117,6 +117,13 @@ def test_lost_gimbal_control_ends_seek_with_the_owner() -> None:
     assert_failed(harness.outcome(command, 1.0), "lost the gimbal", "245/190")
 
 
+def test_gimbal_that_is_not_free_is_not_pointed() -> None:
+    used, of_another = harness_with_gimbal(), harness_with_gimbal(primary=(245, 190))
+    engaged(used, seek())
+    assert_failed(used.command(aim=GimbalAim(0.0)).result(), "in use by seek")
+    assert_failed(of_another.command(aim=GimbalAim(0.0)).result(), "gimbal needs ", "245/190 has")
+
+
 @pytest.mark.parametrize("behaviour", [seek(), PointGimbalBehaviour(GimbalAim(-0.5))])
 def test_previous_gimbal_problem_does_not_end_the_next(behaviour: Behaviour) -> None:
     """A behaviour begins in the step in which the previous one is replaced."""
