@@ -269,7 +269,8 @@ class Behaviour(ABC):
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """Points it would fly to if it began now, local NED metres, as far as they are known.
 
-        For one of `later` the horizontal position is NaN, and a point with a NaN is not checked.
+        For one of `later` the horizontal position is NaN, and a point with a NaN is not checked. Raises
+        ValueError with the reason if they cannot be known now; only one of `later` may begin then.
         """
         return ()
 

@@ -204,7 +204,13 @@ class Guidance:
         _, _, down = context.state.position_ned_m or home
         elsewhere = replace(context, state=replace(context.state, position_ned_m=(math.nan, math.nan, down)))
         for each, begun in ((behaviour, context), *((later, elsewhere) for later in behaviour.later)):
-            if (why := self.setpoints.check_goals(each.goals(begun), context.state)) is not None:
+            try:
+                goals = each.goals(begun)
+            except ValueError as error:
+                if each is behaviour:
+                    return f"{each.name}: {error}"
+                continue  # it may be known when it begins
+            if (why := self.setpoints.check_goals(goals, context.state)) is not None:
                 return f"{each.name} would leave the limits: {why}"
         return None
 

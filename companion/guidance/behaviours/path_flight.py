@@ -90,10 +90,7 @@ class PathFlight(Behaviour):
 
     def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
         """See Behaviour."""
-        try:
-            return tuple(self._points(context))
-        except ValueError:
-            return ()  # reported when it begins
+        return tuple(self._points(context))
 
     def on_activate(self, context: BehaviourContext) -> None:
         position, self._yaw_rad = position_and_yaw(context.state)

@@ -64,10 +64,13 @@ def test_request_cancelled_in_its_step_is_not_made() -> None:
     assert not harness.vehicle.armed
 
 
-def test_failing_check_is_refused_and_the_flight_goes_on() -> None:
+@pytest.mark.parametrize(
+    "command", ["follow-path 0,0;10,0 speed=2", "goto 10 0", "patrol points=0,0;10,0 classes=car"]
+)
+def test_unknown_goal_is_refused_and_the_flight_goes_on(command: str) -> None:
     harness = GuidanceHarness(flying(), inputs=with_state(home_position_ned_m=None))
     engaged(harness)
-    assert_failed(harness.command("follow-path 0,0;10,0 speed=2").result(), "home")
+    assert_failed(harness.command(command).result(), "home")
     assert kinds(harness)[-1] is EventKind.REFUSED
     harness.run(0.5)
     assert harness.guidance.phase is Phase.OFFBOARD
