@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from companion.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
+from companion.learning.evaluate import JUDGED_CONFIDENCE, evaluate_dataset, map_classes
 from companion.settings.perception import TrackerSection
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import example_scenes, load_scene, scene_or_demo
@@ -36,9 +36,9 @@ from mavlink_sim.datasets.training_scenes import MIN_AREA_PX, MIN_SIDE_PX, MIN_V
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import DEFAULT_MODEL, Detector
 from vision.evaluation.datasets import Dataset, Sample, read_image
+from vision.evaluation.metrics import WRONG, ImageResult, judge, operating_points, score_detections
 from vision.tracking.association import overlaps
-from vision.yolo.metrics import WRONG, ImageResult, judge, operating_points, score_detections
-from vision.yolo.recipe import HELD_OUT_SEED
+from vision.training.recipe import HELD_OUT_SEED
 
 CONFIRMED = TrackerSection().confirm_score
 """A track is confirmed, and may be flown to, from this median confidence on."""

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 
 from benchmarks.flights import add_seeds
-from companion.campaign import ClusterError, SeedError, map_seeds
+from companion.simulation.campaign import ClusterError, SeedError, map_seeds
 from mavlink_sim.camera.image_effects import ImageEffects
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.datasets.board_views import LENSES, BoardCamera, board_pairs, board_poses, random_rig

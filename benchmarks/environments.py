@@ -11,7 +11,7 @@ from functools import partial
 import gymnasium
 import numpy as np
 
-from companion.campaign import map_seeds
+from companion.simulation.campaign import map_seeds
 from mavlink_sim.environments import TASKS
 from mavlink_sim.environments.autopilot_model import AutopilotModel
 from mavlink_sim.environments.fast_model import FastModel

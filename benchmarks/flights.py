@@ -25,7 +25,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from companion.campaign import ClusterError, SeedError, map_seeds, seeds_of
+from companion.simulation.campaign import ClusterError, SeedError, map_seeds, seeds_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,11 +40,11 @@ from benchmarks.rendered import camera_settings, rendered_scene
 from companion.bench.lockstep_flight import LockstepFlight
 from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose
-from companion.campaign import ClusterError, SeedError, map_seeds
 from companion.guidance.objects.from_detections import Pose
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import TrackedObject
+from companion.simulation.campaign import ClusterError, SeedError, map_seeds
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.renderer import Rendered
 from mavlink_sim.lockstep import LockstepVehicle

@@ -11,56 +11,50 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 
-# Each package and module of `companion` with its layer; it may import from lower layers alone.
+# Each package of `companion` with its layer; it may import from lower layers alone.
 COMPANION_LAYERS = {
-    "campaign": 0,
-    "child_process": 2,
-    "clock": 0,
-    "config_check": 9,
     "geometry": 0,
-    "journal": 1,
-    "key_files": 0,
-    "peer_data": 0,
-    "plugins": 0,
-    "restarts": 0,
-    "scheduling": 0,
-    "load": 0,
-    "passing": 0,
-    "tasks": 1,
-    "toml_text": 0,
+    "host": 0,
     "settings": 1,
     "vehicle": 2,
-    "relay": 3,
     "guidance": 3,
-    "client": 6,
     "operator": 4,
     "perception": 4,
     "bus": 5,
-    "language": 7,
+    "client": 6,
     "recording": 6,
+    "language": 7,
     "service": 7,
     "dashboard": 8,
-    "sim_session": 8,
-    "demo": 9,
-    "play": 9,
-    "preview": 9,
-    "detect": 9,
-    "calibrate": 9,
-    "collect": 9,
-    "evaluate": 8,
-    "flight_log": 9,
-    "markers": 9,
-    "sightings": 9,
+    "camera_tools": 9,
+    "logs": 9,
     "models": 9,
-    "replay": 9,
-    "replay_perception": 8,
-    "replay_timeline": 0,
-    "train": 9,
-    "train_policy": 9,
-    "training_display": 0,
-    "bench": 9,
-    "cli": 10,
+    "simulation": 9,
+    "bench": 10,
+    "learning": 10,
+    "cli": 11,
 }
+# What never runs beside a flight's own processes: it makes, measures, inspects, or simulates.
+WORKSHOP = (
+    "companion.bench",
+    "companion.camera_tools",
+    "companion.learning",
+    "companion.logs",
+    "companion.models",
+    "companion.simulation",
+    "mavlink_sim",
+    "vision.calibration",
+    "vision.evaluation",
+    "vision.exports",
+    "vision.training",
+)
+# The programs of a flight; of `companion.cli` only this command is one.
+PROGRAMS = (
+    "companion.cli.run",
+    "companion.dashboard.__main__",
+    "companion.perception.worker",
+    "companion.recording.__main__",
+)
 # The same inside `companion.guidance`: its folders, and its own files.
 GUIDANCE_LAYERS = {
     "motion": 0,
@@ -122,27 +116,27 @@ SINGLE_STEP_TESTS = {
     "tests/companion/guidance/test_seek_needs_a_gimbal.py",
     "tests/companion/guidance/test_takeoff_land_stop.py",
 }
-# Elsewhere `companion.tasks.spawn`, which logs an error that ends a task: here the task is awaited where it
-# is started, so the error is raised there.
+# Elsewhere `companion.host.tasks.spawn`, which logs an error that ends a task: here the task is awaited where
+# it is started, so the error is raised there.
 AWAITED_TASKS = {
     "companion/bench/bus.py",
     "companion/bench/setpoints.py",
     "companion/cli/ask.py",
     "companion/cli/run.py",
     "companion/dashboard/chat.py",
-    "companion/demo.py",
+    "companion/simulation/demo.py",
     "companion/language/serve.py",
     "companion/perception/supervisor.py",
-    "companion/play.py",
+    "companion/simulation/play.py",
     "companion/service/ending.py",
     "companion/service/service.py",
-    "companion/sim_session.py",
-    "companion/tasks.py",
+    "companion/simulation/session.py",
+    "companion/host/tasks.py",
 }
 # File → places that copy a payload. The simulator does not import the companion: it checks by itself; a
 # payload of MAVLink has at most 255 bytes.
 COPIES_OF_PAYLOADS = {
-    "companion/peer_data.py": 1,
+    "companion/host/peer_data.py": 1,
     "mavlink_sim/faults/injector.py": 1,
     "mavlink_sim/services/file_transfer.py": 1,
 }
@@ -152,7 +146,7 @@ SERVICE, MAX_SERVICE_LINES = ROOT / "companion" / "service", 250
 SIMULATOR_MAY_IMPORT = {
     "vision.attitude",
     "vision.calibration.boards",
-    "vision.calibration.camera_info",
+    "vision.calibration_files.camera_info",
     "vision.camera_model",
     "vision.class_names",
     "vision.depth_registration",
@@ -166,7 +160,7 @@ SIMULATOR_MAY_IMPORT = {
     "vision.shared_frame",
     "vision.text_file",
 }
-MAY_IMPORT_SIMULATOR = {"sim_session", "demo", "play", "train", "train_policy", "bench", "models"}
+MAY_IMPORT_SIMULATOR = {"simulation", "learning", "bench", "models"}
 
 
 @cache
@@ -261,6 +255,42 @@ def test_parts_of_the_companion_import_downwards_only() -> None:
             if not other.startswith("companion.") or part(other) == here:
                 continue
             assert COMPANION_LAYERS[part(other)] < COMPANION_LAYERS[here], f"{name} imports upwards: {other}"
+
+
+def in_workshop(module: str) -> bool:
+    return f"{module}.".startswith(tuple(f"{package}." for package in WORKSHOP))
+
+
+def test_nothing_that_flies_imports_the_workshop() -> None:
+    for package in WORKSHOP:
+        assert package in modules(), package
+    for name, path in modules().items():
+        if not in_workshop(name) and not name.startswith("companion.cli."):
+            found = sorted(filter(in_workshop, imports_of(name, path)))
+            assert not found, f"{name} flies and imports {found}"
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_a_program_of_a_flight_has_no_workshop_in_it(program: str) -> None:
+    reached, waiting = {program}, [program]
+    while waiting:
+        name = waiting.pop()
+        new = imports_of(name, modules()[name]) - reached
+        assert not [module for module in new if in_workshop(module)], name
+        reached |= new
+        waiting += new
+
+
+def test_what_flies_is_at_most_twenty_packages() -> None:
+    packages = {".".join(name.split(".")[:2]) for name in modules() if name.count(".") > 1}
+    flying = {name for name in packages if not in_workshop(name)} - {"companion.cli"}
+    assert {"companion.guidance", "vision.sources"} < flying
+    assert len(flying) <= 20, sorted(flying)
+
+
+def test_the_root_of_the_companion_holds_packages_alone() -> None:
+    files = {path.name for path in (ROOT / "companion").glob("*.py")}
+    assert files <= {"__init__.py", "__main__.py"}
 
 
 def test_parts_of_guidance_import_downwards_only() -> None:
@@ -394,14 +424,14 @@ def test_no_circular_imports(package: str) -> None:
 
 @pytest.mark.parametrize("package", ["companion", "vision", "mavlink_sim"])
 def test_every_part_is_in_the_document(package: str) -> None:
-    document = (ROOT / "docs" / "architecture.md").read_text()
+    named = re.findall(r"`([^`\n]+)`", (ROOT / "docs" / "architecture.md").read_text().replace("```", ""))
     names = {
-        f"`{path.name}`" if path.suffix == ".py" else f"`{path.name}/`"
+        path.name if path.suffix == ".py" else f"{path.name}/"
         for path in (ROOT / package).iterdir()
         if (path.suffix == ".py" and not path.name.startswith("__")) or (path / "__init__.py").is_file()
     }
     assert names
-    assert not sorted(name for name in names if name not in document)
+    assert not sorted(name for name in names if not {name, f"{package}/{name}"} & set(named))
 
 
 def test_an_assert_only_narrows_a_type() -> None:
@@ -461,7 +491,7 @@ def _unbounded_copies(tree: ast.AST) -> list[int]:
 
 
 def test_only_one_function_copies_what_a_peer_sent() -> None:
-    """`companion.peer_data.copy_payload` checks the size first; `vision` does not know zenoh."""
+    """`companion.host.peer_data.copy_payload` checks the size first; `vision` does not know zenoh."""
     found = {}
     for package in ("companion", "mavlink_sim"):
         for path in (ROOT / package).rglob("*.py"):

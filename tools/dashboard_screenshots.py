@@ -20,7 +20,7 @@ from pathlib import Path
 from mavlink_sim.testing import free_port
 from tests.alone.test_page import OPENED, REPLY, click_track, open_page
 from tests.companion.dashboard.chromium import Tab, chromium
-from tests.companion.test_play import playing
+from tests.companion.simulation.test_play import playing
 
 WIDE, PHONE = (1360, 860), (390, 844)
 FLEET = 4

@@ -4,12 +4,13 @@
 
 `companion train` does the same on a processor, in hours. Here processes draw the scenes of
 `mavlink_sim.datasets.training_scenes` into a pool in shared memory and replace the oldest ones without end.
-The trainer keeps a copy of the pool on the GPU and makes its batches there, as `vision.yolo.scene_batches`
-does on the processor: a whole scene, reduced, or a part of it, mirrored and recoloured. Images of both sizes
-of `SIZES` alternate. The learning rate falls with the time, to almost zero at its end. The result is the
-average of the weights. The biases of the classes are then lowered until the precision of each is `PRECISION`
-at the confidence that confirms a track, on images of 640 pixels, the size of the camera; other sizes are not
-calibrated. It is not repeatable to the bit: how many scenes are drawn depends on the machine.
+The trainer keeps a copy of the pool on the GPU and makes its batches there, as
+`vision.training.scene_batches` does on the processor: a whole scene, reduced, or a part of it, mirrored and
+recoloured. Images of both sizes of `SIZES` alternate. The learning rate falls with the time, to almost zero
+at its end. The result is the average of the weights. The biases of the classes are then lowered until the
+precision of each is `PRECISION` at the confidence that confirms a track, on images of 640 pixels, the size of
+the camera; other sizes are not calibrated. It is not repeatable to the bit: how many scenes are drawn depends
+on the machine.
 
 Several `--rate` train as many networks at the same time, on the same scenes.
 """
@@ -44,14 +45,14 @@ from benchmarks.bundled_model import CONFIRMED, detect, draw
 from mavlink_sim.datasets.training_scenes import training_scene
 from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import RENDERED_SCENES
+from vision.evaluation.metrics import operating_points
+from vision.training.losses import Truth, detection_loss
+from vision.training.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, NMS_IOU, REFINEMENT, evaluate
+from vision.training.scene_batches import PADDING_GREY
+from vision.training.training import prepare_start, update_average
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
-from vision.yolo.losses import Truth, detection_loss
-from vision.yolo.metrics import operating_points
 from vision.yolo.published import yolov8_description
-from vision.yolo.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, NMS_IOU, REFINEMENT, evaluate
-from vision.yolo.scene_batches import PADDING_GREY
-from vision.yolo.training import prepare_start, update_average
 
 WIDTH, HEIGHT = 640, 480
 """Pixels of a drawn scene."""

@@ -96,7 +96,7 @@ class Detector(ObjectDetector):
 
         Args:
             model: `default`, the bundled one, of the file that `model_path` says, or the path of a checkpoint
-                (our own, or an Ultralytics `.pt`), of a file exported by `vision.runtimes.export`, or of
+                (our own, or an Ultralytics `.pt`), of a file exported by `vision.exports.export`, or of
                 another exporter's that is recognised (`vision.foreign.layouts`).
             classes: names or ids to report; None for all. The network does not compute the others.
             confidence: boxes not above this are dropped, 0..1.

@@ -25,10 +25,10 @@ from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.session import Bus, encode
-from companion.peer_data import copy_payload, parse_object
+from companion.host.peer_data import copy_payload, parse_object
+from companion.host.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.perception.messages import Report, StartFailed
 from companion.perception.process import PerceptionProcess
-from companion.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.settings import Settings, ZenohSection
 from mavlink_sim.datasets.training_scenes import random_scene
 from mavlink_sim.testing import free_port

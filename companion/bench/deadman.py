@@ -27,7 +27,7 @@ from companion.bus.client import client_settings, listen, open_client, send_comm
 from companion.bus.topics import command_key
 from companion.settings import Settings
 from companion.settings.reading import to_toml
-from companion.sim_session import (
+from companion.simulation.session import (
     ALTITUDE_M,
     SimOptions,
     SimSessionError,

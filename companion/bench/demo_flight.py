@@ -19,10 +19,10 @@ from companion.bench.rendered_camera import RenderedCamera
 from companion.bench.simulated_driver import RATES_HZ, SimulatedDriver
 from companion.bench.synthetic_camera import SyntheticCamera
 from companion.bench.synthetic_detector import SceneObject, ScenePose, SyntheticDetector
-from companion.campaign import map_seeds
 from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.settings import Settings
-from companion.sim_session import (
+from companion.simulation.campaign import map_seeds
+from companion.simulation.session import (
     DEMO_NOISE,
     FIND,
     MISSION,

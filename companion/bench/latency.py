@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from companion.bench.percentiles import percentiles
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.service import Service
-from companion.sim_session import (
+from companion.simulation.session import (
     ALTITUDE_M,
     SimOptions,
     SimSessionError,

@@ -18,9 +18,9 @@ from companion.perception.assembly import (
     build_pipeline,
     load_detector,
 )
-from companion.plugins import load_plugins
 from companion.settings import Settings
 from companion.settings.perception import DetectorSection, TrackerSection
+from companion.settings.plugins import load_plugins
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.simulated_camera import Captured, SimulatedCamera

@@ -11,7 +11,7 @@ from multiprocessing.synchronize import Semaphore
 
 import numpy as np
 
-from companion.scheduling import schedule_as_any_program, set_scheduler_slice
+from companion.host.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.streamer import Streamer
 

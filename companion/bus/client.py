@@ -27,7 +27,7 @@ from companion.bus.topics import (
     alive_key,
     command_key,
 )
-from companion.peer_data import PeerDataError, copy_payload, parse_object
+from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 from companion.settings import ZenohSection
 
 _DISCOVERY_S = 2.0

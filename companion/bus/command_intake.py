@@ -10,7 +10,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
-from companion.peer_data import Payload, PeerDataError, copy_payload
+from companion.host.peer_data import Payload, PeerDataError, copy_payload
 
 LARGEST_COMMAND_BYTES = 160 * 1024
 """A line, and for a mission its file."""

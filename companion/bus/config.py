@@ -8,7 +8,7 @@ from typing import Any
 
 import zenoh
 
-from companion.passing import PassingError
+from companion.host.passing import PassingError
 from companion.settings import ZenohSection
 from vision.file_kinds import open_file
 from vision.redaction import redacted

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.topics import Topic
-from companion.peer_data import Payload, PeerDataError, copy_payload
+from companion.host.peer_data import Payload, PeerDataError, copy_payload
 
 logger = logging.getLogger(__name__)
 

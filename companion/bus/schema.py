@@ -14,7 +14,7 @@ from typing_extensions import get_original_bases
 
 from companion.bus.bodies import frames, service, vehicle
 from companion.bus.topics import INPUT_TOPICS, TOPICS, Topic
-from companion.peer_data import PeerDataError, parse_object
+from companion.host.peer_data import PeerDataError, parse_object
 from companion.settings.section import texts_below_keys
 
 DIALECT = GenerateJsonSchema.schema_dialect

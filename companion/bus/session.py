@@ -36,10 +36,10 @@ from companion.bus.topics import (
     alive_key,
     command_key,
 )
-from companion.peer_data import Payload, copy_payload
-from companion.scheduling import set_scheduler_slice
+from companion.host.peer_data import Payload, copy_payload
+from companion.host.scheduling import set_scheduler_slice
+from companion.host.tasks import error_text, keep_running, spawn
 from companion.settings import ZenohSection
-from companion.tasks import error_text, keep_running, spawn
 from vision.redaction import redacted
 
 __all__ = ["Bus", "BusError", "encode", "zenoh_config"]

@@ -43,7 +43,7 @@ def ask(
     from companion.bus.session import BusError
     from companion.language.endpoints import LanguageError, endpoint_from
     from companion.language.tools import check_words
-    from companion.plugins import PluginError, load_plugins
+    from companion.settings.plugins import PluginError, load_plugins
 
     with plain_errors(NoAnswerError, BusError, PluginError, LanguageError, ValueError):
         load_plugins(settings.plugins.modules)

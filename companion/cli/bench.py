@@ -89,7 +89,7 @@ def bench_latency(
     from companion.bus.session import BusError
     from companion.perception.supervisor import PerceptionStartError
     from companion.settings.reading import ConfigurationError
-    from companion.sim_session import SimSessionError
+    from companion.simulation.session import SimSessionError
     from companion.vehicle.driver import LinkError
 
     with plain_errors(SimSessionError, ConfigurationError, LinkError, PerceptionStartError, BusError):
@@ -156,7 +156,7 @@ def bench_deadman(
     from companion.bench.deadman import deadman_table, measure_deadman
     from companion.bus.client import NoAnswerError
     from companion.bus.session import BusError
-    from companion.sim_session import SimSessionError
+    from companion.simulation.session import SimSessionError
 
     with plain_errors(SimSessionError, BusError, NoAnswerError):
         figures = measure_deadman(runs)

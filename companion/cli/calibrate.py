@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command, with_default
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 
 if TYPE_CHECKING:
-    from companion.calibrate import Collected
+    from companion.camera_tools.calibrate import Collected
     from companion.settings import Settings
 
 
@@ -95,10 +95,10 @@ def lens(
     Writes camera.yaml for camera.calibration_file. A live camera is read until the views are complete, or
     until Ctrl-C.
     """
-    from companion.calibrate import collect_views, result_lines, write_report
+    from companion.camera_tools.calibrate import collect_views, result_lines, write_report
     from vision.calibration.boards import Board
     from vision.calibration.calibrate import calibrate as calibrate_views
-    from vision.calibration.camera_info import camera_identity, write_camera_info
+    from vision.calibration_files.camera_info import camera_identity, write_camera_info
     from vision.sources import SourceError, SourceSettings, open_source
 
     log_to_standard_error(logging.WARNING, "companion: %(message)s")
@@ -154,10 +154,10 @@ def extrinsics(
     Writes depth.yaml for source.depth_calibration_file. Both see one board at the same time. Two folders
     are paired by file name.
     """
-    from companion.calibrate import collect_views, extrinsics_lines
+    from companion.camera_tools.calibrate import collect_views, extrinsics_lines
     from vision.calibration.boards import Board
-    from vision.calibration.camera_info import read_camera_info, write_camera_info
     from vision.calibration.extrinsics import extrinsics_from_views
+    from vision.calibration_files.camera_info import read_camera_info, write_camera_info
     from vision.sources import SourceError, SourceSettings
     from vision.sources.opening import open_two
 
@@ -226,9 +226,9 @@ def mount(
     from companion.bus.client import NoAnswerError, client_settings, listen, open_client
     from companion.bus.session import BusError
     from companion.bus.topics import VEHICLE
-    from companion.calibrate import LiveTilt, markers_of
-    from vision.calibration.camera_info import read_camera_info
+    from companion.camera_tools.calibrate import LiveTilt, markers_of
     from vision.calibration.mount import mount_from_markers
+    from vision.calibration_files.camera_info import read_camera_info
     from vision.markers import MarkerKind
     from vision.sources import SourceError, SourceSettings, open_source
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import plain_errors
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -91,8 +91,8 @@ def preview(
 ) -> None:
     """Show what a source delivers. Prints size, measured rate and stamp once a second. Ends on Ctrl-C."""
     from companion.bus import topics
+    from companion.camera_tools.preview import PreviewOptions, attitudes_of, preview_source
     from companion.perception.assembly import build_levelling
-    from companion.preview import PreviewOptions, attitudes_of, preview_source
     from companion.vehicle.driver import LinkError
 
     topic = topics.IMAGE.key(settings.vehicle.name)
@@ -121,8 +121,8 @@ def depth(
 
     Prints the depth at the centre, and with --detect that of each object, one line per frame.
     """
+    from companion.camera_tools.preview import DepthRecorder, depth_source
     from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
-    from companion.preview import DepthRecorder, depth_source
 
     played = settings.source.model_copy(update={"realtime": False})  # every frame of a recording
     settings = settings.model_copy(update={"source": played})
@@ -147,7 +147,7 @@ def _with_calibration(settings: Settings, source: Source) -> Settings:
 @contextmanager
 def opened(settings: Settings, uri: str | None) -> Iterator[Source]:
     """Open a source with the settings of section `source`; errors are one line, Ctrl-C ends."""
-    from companion.plugins import PluginError, load_plugins
+    from companion.settings.plugins import PluginError, load_plugins
     from vision.sources import SourceError, open_source
 
     log_to_standard_error(logging.WARNING, "companion: %(message)s")

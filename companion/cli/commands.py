@@ -37,7 +37,7 @@ from companion.cli.topics import topics
 from companion.cli.train import train
 from companion.cli.train_policy import train_policy
 from companion.cli.view import view
-from companion.journal import is_journal, marked_for_journal, redact_last_resort
+from companion.host.journal import is_journal, marked_for_journal, redact_last_resort
 from vision.redaction import HIDDEN, print_traceback, redacted
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def config(
     from companion.settings.reading import ConfigurationError, to_toml
 
     if check:
-        from companion.config_check import check_settings
+        from companion.cli.config_check import check_settings
 
         with plain_errors(ConfigurationError):
             for line in check_settings(settings):
@@ -164,7 +164,7 @@ def commands(
 ) -> None:
     """List the flight commands. Prints arguments, units and ranges, including those of plug-ins."""
     from companion.guidance.grammar import describe, json_schema, markdown
-    from companion.plugins import PluginError, load_plugins
+    from companion.settings.plugins import PluginError, load_plugins
 
     with plain_errors(PluginError):
         load_plugins(settings.plugins.modules)

@@ -19,7 +19,7 @@ from companion.cli.flags import (
     check_seed_options,
     plain_errors,
 )
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 
 _DEMO_S, _DEMO_AUTOPILOT_S = 150.0, 300.0
 
@@ -63,10 +63,10 @@ def demo(
         _fly_seeds(seeds, processes, ray, synthetic=synthetic, as_json=as_json)
         return
     from companion.bus.session import BusError
-    from companion.demo import run_demo
     from companion.operator.line_output import LineOutput, use_for_standard_error
     from companion.perception.supervisor import PerceptionStartError
-    from companion.sim_session import SimSessionError
+    from companion.simulation.demo import run_demo
+    from companion.simulation.session import SimSessionError
     from companion.vehicle.driver import LinkError
 
     use_for_standard_error()
@@ -104,7 +104,7 @@ def _fly_seeds(text: str, processes: int, ray: str | None, *, synthetic: bool, a
     from rich.console import Console
 
     from companion.bench.demo_flight import demos_summary, demos_table, fly_demos
-    from companion.campaign import ClusterError, SeedError, seeds_of
+    from companion.simulation.campaign import ClusterError, SeedError, seeds_of
 
     log_to_standard_error(logging.ERROR, "companion: %(message)s")
     with plain_errors(ValueError):

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
+from companion.cli.download import Pull, model_after_pull
 from companion.cli.flags import EXIT_BAD_INPUT, YOLO, plain_errors, warn_rendered_only
-from companion.cli.models import Pull, model_after_pull
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 
@@ -79,8 +79,8 @@ def detect(
     A live image in the browser: companion view SOURCE.
     """
     with gc_paused():
-        from companion.detect import detect_source, make_save_folder
-        from companion.plugins import PluginError, load_plugins
+        from companion.camera_tools.detect import detect_source, make_save_folder
+        from companion.settings.plugins import PluginError, load_plugins
         from vision.detector import forget_measurements, open_detector
         from vision.object_detector import DetectionsError, DetectorSettings
         from vision.pipeline import FrameDetector

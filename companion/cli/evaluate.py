@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from companion.cli.flags import plain_errors
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 
 
 def evaluate(
@@ -55,7 +55,7 @@ def evaluate(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Evaluate a model on a labelled data set. Prints mAP50 and mAP50-95, overall and per class."""
-    from companion.evaluate import (
+    from companion.learning.evaluate import (
         JUDGED_CONFIDENCE,
         evaluate_dataset,
         map_classes,

@@ -18,9 +18,9 @@ import typer
 import typer.core
 import typer.main
 
-from companion.journal import marked_for_journal
-from companion.load import with_load
-from companion.passing import EXIT_PASSING, PassingError
+from companion.host.journal import marked_for_journal
+from companion.host.load import with_load
+from companion.host.passing import EXIT_PASSING, PassingError
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
 from vision.redaction import redacted

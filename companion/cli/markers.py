@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, check_folder, plain_errors, settings_command, with_default
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def detect(
     (forward, right, down), as the camera is mounted.
     """
     with gc_paused():
-        from companion.markers import print_markers
+        from companion.camera_tools.markers import print_markers
         from vision.sources import SourceError, SourceSettings, open_source
 
     log_to_standard_error(logging.WARNING, "companion: %(message)s")
@@ -96,7 +96,7 @@ def print(
     the foot of the page.
     """
     with gc_paused():
-        from companion.campaign import numbers_of
+        from companion.simulation.campaign import numbers_of
         from vision.marker_sheets import marker_sheets, paper_of
         from vision.markers import markers_in
 

@@ -47,7 +47,7 @@ def mcp(
     from companion.bus.session import BusError
     from companion.dashboard.access import DashboardError
     from companion.language.tools import check_words
-    from companion.plugins import PluginError, load_plugins
+    from companion.settings.plugins import PluginError, load_plugins
 
     with plain_errors(NoAnswerError, BusError, DashboardError, PluginError, ValueError):
         load_plugins(settings.plugins.modules)

@@ -35,7 +35,7 @@ def mission(
         plan_from,
         read_mission,
     )
-    from companion.plugins import PluginError, load_plugins
+    from companion.settings.plugins import PluginError, load_plugins
 
     with plain_errors(MissionError, NoAnswerError, BusError, PluginError, ValueError):
         load_plugins(settings.plugins.modules)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from companion.cli.flags import EXIT_BAD_INPUT, EXIT_FAILED, plain_errors
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -74,10 +74,10 @@ def play(
         from companion.operator.line_output import LineOutput, use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.supervisor import PerceptionStartError
-        from companion.play import PlayOptions, SimulationLostError
-        from companion.play import play as start
-        from companion.plugins import PluginError
-        from companion.sim_session import SimSessionError
+        from companion.settings.plugins import PluginError
+        from companion.simulation.play import PlayOptions, SimulationLostError
+        from companion.simulation.play import play as start
+        from companion.simulation.session import SimSessionError
         from companion.vehicle.driver import LinkError
 
     use_for_standard_error()

@@ -79,10 +79,10 @@ def replay(
     the targets that this model finds in the recorded images, with ranges from the recorded depth where it is
     there, without an operator's selection.
     """
-    from companion.plugins import PluginError, load_plugins
+    from companion.logs.replay import replay as replay_files
+    from companion.logs.replay import report
     from companion.recording import RecordingError
-    from companion.replay import replay as replay_files
-    from companion.replay import report
+    from companion.settings.plugins import PluginError, load_plugins
     from companion.settings.reading import ConfigurationError
 
     with plain_errors(RecordingError, ConfigurationError, PluginError, ValueError):  # of a model
@@ -117,11 +117,11 @@ def collect(
     service until Ctrl-C. The labels are the model's own boxes; correct them, then train with `companion
     train --data FOLDER`.
     """
-    from companion import collect as collecting
     from companion.bus.client import NoAnswerError, client_settings
     from companion.bus.config import BusError
+    from companion.learning import collect as collecting
+    from companion.logs.frames import recorded_frames
     from companion.recording import RecordingError
-    from companion.recording.frames import recorded_frames
 
     ending = threading.Event()
     kept = 0
@@ -159,7 +159,7 @@ def sightings(
     if as_geojson == as_kml:
         typer.echo("companion: expected --geojson or --kml, one of them", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)
-    from companion import sightings as found_in
+    from companion.logs import sightings as found_in
     from companion.recording import RecordingError
 
     with plain_errors(RecordingError):
@@ -175,7 +175,7 @@ def list_recordings(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per file.")] = False,
 ) -> None:
     """List the recordings of a folder. Prints for each: vehicle, start, duration, size, flights."""
-    from companion.flight_log import listed, summaries
+    from companion.logs.flight_log import listed, summaries
     from companion.recording import RecordingError
 
     with plain_errors(RecordingError):
@@ -195,7 +195,7 @@ def show_recording(
 
     Prints events, modes, arming, refused commands, images, depth, losses and damage.
     """
-    from companion.flight_log import shown, summarize
+    from companion.logs.flight_log import shown, summarize
     from companion.recording import RecordingError
 
     with plain_errors(RecordingError):

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from companion.cli.download import Pull, model_after_pull
 from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
-from companion.cli.models import Pull, model_after_pull
-from companion.journal import log_to_standard_error
-from companion.tasks import spawn
+from companion.host.journal import log_to_standard_error
+from companion.host.tasks import spawn
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
@@ -51,13 +51,13 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
     """Run the service, as `run`. `on_page` is called with the page's line that has its address."""
     with gc_paused():
         from companion.bus.config import BusError
-        from companion.config_check import check_settings
+        from companion.cli.config_check import check_settings
         from companion.language.process import AskProcess
         from companion.operator.line_output import use_for_standard_error
         from companion.operator.metrics import MetricsError
         from companion.perception.supervisor import PerceptionStartError
-        from companion.plugins import PluginError
         from companion.service import Service
+        from companion.settings.plugins import PluginError
         from companion.settings.reading import ConfigurationError
         from companion.vehicle.driver import LinkError
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from companion.cli.flags import plain_errors
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 
 _DATA = "Your own data"
 
@@ -70,7 +70,7 @@ def train(
 
     Trains it on labelled images (--data), or the default one on rendered scenes.
     """
-    from companion.train import score_lines, train_default, train_on_data
+    from companion.learning.train import score_lines, train_default, train_on_data
     from vision.yolo.safe_pickle import CheckpointError
 
     log_to_standard_error(logging.INFO, "%(message)s")

@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from companion.campaign import MAX_SEED, ClusterError, SeedError, seeds_of
 from companion.cli.flags import Processes, RayAddress, check_seed_options, plain_errors
+from companion.simulation.campaign import MAX_SEED, ClusterError, SeedError, seeds_of
 
 
 def train_policy(
@@ -28,7 +28,7 @@ def train_policy(
     """Train a policy in a simulated environment. Writes an ONNX file for the flight command `policy`."""
     check_seed_options(context)
     from companion.guidance.policy_file import PolicyError
-    from companion.train_policy import PolicyTrainingError, Training, train_policies, train_policy
+    from companion.learning.train_policy import PolicyTrainingError, Training, train_policies, train_policy
 
     with plain_errors(PolicyTrainingError, PolicyError, ClusterError, SeedError, ValueError, OSError):
         if seeds is None:

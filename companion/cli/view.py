@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from companion.cli.download import Pull
 from companion.cli.flags import EXIT_BAD_INPUT
-from companion.cli.models import Pull
 from companion.cli.run import after_pull, run_service
 
 if TYPE_CHECKING:

@@ -23,7 +23,7 @@ from companion.bus.client import NoAnswerError, client_settings, open_client, se
 from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.endings import Endings
 from companion.client.stream import Stream
-from companion.peer_data import copy_payload, parse_json, parse_object
+from companion.host.peer_data import copy_payload, parse_json, parse_object
 from companion.settings import ZenohSection
 
 # Longer than any command; a caller's `asyncio.timeout` ends it earlier.

@@ -13,7 +13,7 @@ import zenoh
 from companion.bus import topics
 from companion.bus.bodies.service import CommandStateBody
 from companion.bus.client import SILENT_S, LastStatus, NoAnswerError, subscribe_kept
-from companion.peer_data import PeerDataError, copy_payload, parse_object
+from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 
 _KEPT = 1000
 

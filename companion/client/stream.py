@@ -15,7 +15,7 @@ import zenoh
 
 from companion.bus.client import subscribe_kept
 from companion.bus.topics import Topic
-from companion.peer_data import PeerDataError, copy_payload
+from companion.host.peer_data import PeerDataError, copy_payload
 
 T = TypeVar("T")
 

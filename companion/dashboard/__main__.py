@@ -12,11 +12,11 @@ import sys
 
 from companion.bus.client import settings_in_child
 from companion.bus.config import BusError
-from companion.child_process import EXIT_REFUSED, on_parent_end
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
-from companion.passing import EXIT_PASSING, PassingError
-from companion.scheduling import lower_priority
+from companion.host.child_process import EXIT_REFUSED, on_parent_end
+from companion.host.passing import EXIT_PASSING, PassingError
+from companion.host.scheduling import lower_priority
 from companion.settings import LanguageSection
 
 

@@ -20,7 +20,7 @@ from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.key_files import KeyFileError, check_private
+from companion.settings.key_files import KeyFileError, check_private
 from vision.file_kinds import open_file
 
 HEADER = "x-companion-dashboard"

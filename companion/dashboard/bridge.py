@@ -32,7 +32,7 @@ from companion.bus.topics import (
     VEHICLE,
 )
 from companion.dashboard.merge import Sighting
-from companion.peer_data import PeerDataError, copy_payload, parse_object
+from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 
 logger = logging.getLogger(__name__)
 

@@ -21,10 +21,10 @@ from companion.bus.client import NoAnswerError
 from companion.client import Drone
 from companion.client.commands import Reply
 from companion.dashboard.fleet import Fleet
+from companion.host.tasks import spawn
 from companion.operator.reply_text import ENDED_BY_STOP
-from companion.plugins import PluginError, load_plugins
 from companion.settings import LanguageSection
-from companion.tasks import spawn
+from companion.settings.plugins import PluginError, load_plugins
 
 if TYPE_CHECKING:
     import zenoh

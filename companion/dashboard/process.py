@@ -8,7 +8,7 @@ from contextlib import asynccontextmanager
 
 from companion.bus.client import NoAnswerError, settings_for_child
 from companion.bus.config import BusError
-from companion.child_process import child_process
+from companion.host.child_process import child_process
 from companion.settings import Settings
 
 

@@ -34,9 +34,9 @@ from companion.dashboard.bridge import Bridge, News
 from companion.dashboard.chat import MAX_SENTENCE_CHARACTERS, Chats
 from companion.dashboard.connections import connection_class, connection_of
 from companion.dashboard.fleet import MAX_VEHICLES, Fleet
-from companion.passing import AddressTakenError
+from companion.host.passing import AddressTakenError
+from companion.host.tasks import spawn
 from companion.settings import LanguageSection, ZenohSection
-from companion.tasks import spawn
 
 NICENESS = 5
 """Of the server's process: the loop that steers has priority."""

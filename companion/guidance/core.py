@@ -15,7 +15,6 @@ import logging
 import math
 from dataclasses import dataclass, replace
 
-from companion.clock import BUFFERED_S, Standstill
 from companion.guidance.behaviour import NO_GIMBAL, Behaviour, BehaviourContext, Outcome, Requirement
 from companion.guidance.behaviour_runner import BehaviourRunner
 from companion.guidance.behaviours.stop import StopBehaviour
@@ -37,6 +36,7 @@ from companion.guidance.objects.in_view import Choice, ObjectsInView
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
 from companion.guidance.requirements import check_requirements
 from companion.guidance.setpoint_output import SetpointOutput
+from companion.host.clock import BUFFERED_S, Standstill
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S
 from vision.obstacle_sectors import ObstacleSectors

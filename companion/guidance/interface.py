@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
 
-from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour, Outcome, VelocityInput
 from companion.guidance.formation.neighbours import Neighbourhood
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
@@ -14,6 +13,7 @@ from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans
 from companion.guidance.objects.target import Target
 from companion.guidance.objects.tracked_object import GimbalGoal, TrackedObject
 from companion.guidance.search_pattern import Footprint
+from companion.host.clock import Standstill
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
 from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget

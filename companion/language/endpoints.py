@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from companion.key_files import KeyFileError, check_private
 from companion.language.tools import MAX_CALLS, ToolCall, arguments_of, calls_of
 from companion.settings import LanguageSection
+from companion.settings.key_files import KeyFileError, check_private
 from vision.extras import install_command
 from vision.file_kinds import kind_of_bytes, open_file
 from vision.redaction import redacted

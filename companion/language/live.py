@@ -20,12 +20,12 @@ from companion.bus.bodies.vehicle import VehicleBody
 from companion.bus.client import image_of
 from companion.client import CommandFailedError, Drone, Stream
 from companion.client.commands import Reply
+from companion.host.peer_data import PeerDataError
 from companion.language.control import CommandEvents, Control
 from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import Endpoint
 from companion.language.scene import Scene, SceneObject
 from companion.language.tools import class_names_of
-from companion.peer_data import PeerDataError
 
 T = TypeVar("T")
 

@@ -25,10 +25,10 @@ from starlette.routing import Route
 from companion.client import NoAnswerError
 from companion.client.commands import NON_FLIGHT, Reply
 from companion.guidance.command import Command, GrammarError
+from companion.host.tasks import spawn
 from companion.language.clauses import QUESTIONS
 from companion.language.conversation import Vehicle, answer_to
 from companion.language.tools import ToolCall, class_names_of, read_call, tools_of
-from companion.tasks import spawn
 
 PATH = "/mcp"
 WAIT_S = 20.0

@@ -13,10 +13,10 @@ from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import Callable
 from contextlib import suppress
 
-from companion.scheduling import schedule_as_any_program
+from companion.host.scheduling import schedule_as_any_program
+from companion.host.tasks import spawn
 from companion.settings import Settings
 from companion.settings.reading import flags
-from companion.tasks import spawn
 
 NICENESS = 5
 _SECTIONS = ("zenoh", "language", "plugins")

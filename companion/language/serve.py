@@ -15,12 +15,12 @@ import zenoh
 
 from companion.bus.topics import ROOT
 from companion.client import NoAnswerError
+from companion.host.peer_data import PeerDataError, copy_payload
+from companion.host.tasks import spawn
 from companion.language.conversation import Conversation, Operator
 from companion.language.endpoints import LanguageError
 from companion.language.sentences import is_stop
 from companion.operator.reply_text import ENDED_BY_STOP
-from companion.peer_data import PeerDataError, copy_payload
-from companion.tasks import spawn
 
 ASK = "ask"
 MAX_SENTENCE_BYTES = 2000

@@ -9,8 +9,8 @@ import sys
 from collections.abc import Awaitable, Callable
 from typing import Any, Protocol
 
+from companion.host.tasks import spawn
 from companion.operator.reply_text import reply_text
-from companion.tasks import spawn
 from vision.extras import missing_module
 
 logger = logging.getLogger(__name__)

@@ -17,7 +17,7 @@ import threading
 import time
 from collections import deque
 
-from companion.journal import is_journal, marked
+from companion.host.journal import is_journal, marked
 
 QUEUED_BYTES = 256 * 1024
 """Capacity of the queue; further lines are dropped and counted."""

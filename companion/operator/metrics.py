@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from companion.passing import AddressTakenError
+from companion.host.passing import AddressTakenError
 from vision.extras import install_command
 
 if TYPE_CHECKING:

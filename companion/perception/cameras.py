@@ -24,7 +24,7 @@ from companion.guidance.objects.from_detections import (
 from companion.guidance.objects.ranging import ALL_MEANS, RangeMeans, sees_ground
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import Target
-from companion.load import with_load
+from companion.host.load import with_load
 from companion.perception.messages import AnyPreview
 from companion.perception.process import START_S
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor

@@ -6,7 +6,7 @@ import bisect
 from collections import deque
 from collections.abc import Callable
 
-from companion.clock import StandstillWatch
+from companion.host.clock import StandstillWatch
 from companion.vehicle.state import Vector3
 from vision.camera_model import CameraModel, CameraMount
 from vision.frame import Frame

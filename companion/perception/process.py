@@ -15,6 +15,7 @@ import time
 from collections import deque
 from typing import Self
 
+from companion.host.scheduling import schedule_as_any_program
 from companion.perception.messages import (
     Attitude,
     Begin,
@@ -26,7 +27,6 @@ from companion.perception.messages import (
     packed,
     read_message,
 )
-from companion.scheduling import schedule_as_any_program
 from companion.settings import Settings
 from vision.path_planner import PathRequest
 from vision.tracking import SelectRequest

@@ -1,7 +1,7 @@
 """The perception worker's supervisor: starts it, reads its messages, restarts it when it is dead or stuck.
 
 Nothing here waits for the worker: its messages are processed as they arrive. A worker that is silent for too
-long is killed. It is started again as `companion.restarts` says, without end.
+long is killed. It is started again as `companion.host.restarts` says, without end.
 """
 
 from __future__ import annotations
@@ -16,8 +16,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from companion.load import with_load
-from companion.passing import PassingError
+from companion.host.load import with_load
+from companion.host.passing import PassingError
+from companion.host.restarts import Restart, Restarts
+from companion.host.tasks import error_text, spawn
 from companion.perception.messages import (
     AnyPreview,
     Attitude,
@@ -39,9 +41,7 @@ from companion.perception.messages import (
 from companion.perception.process import PerceptionProcess, RateLimiter, Watchdog
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
-from companion.restarts import Restart, Restarts
 from companion.settings import Settings
-from companion.tasks import error_text, spawn
 from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration

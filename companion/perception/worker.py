@@ -20,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
+from companion.host.scheduling import lower_priority, run_when_idle
 from companion.perception.assembly import (
     CameraTelemetry,
     build_levelling,
@@ -46,10 +47,9 @@ from companion.perception.messages import (
 )
 from companion.perception.previews import CloudEncoder, PreviewEncoder
 from companion.perception.standard_input import STANDARD_INPUT
-from companion.plugins import PluginError, load_plugins
-from companion.scheduling import lower_priority, run_when_idle
 from companion.settings import Settings
 from companion.settings.calibration import adopt_calibration
+from companion.settings.plugins import PluginError, load_plugins
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.model_files import find_model

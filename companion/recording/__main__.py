@@ -12,8 +12,8 @@ from threading import Event
 
 from companion.bus.client import NoAnswerError, open_client, settings_in_child
 from companion.bus.config import BusError
-from companion.child_process import EXIT_REFUSED, on_parent_end
-from companion.passing import EXIT_PASSING, PassingError
+from companion.host.child_process import EXIT_REFUSED, on_parent_end
+from companion.host.passing import EXIT_PASSING, PassingError
 from companion.recording import PAUSED, RecordingError
 from companion.settings import ZenohSection
 from vision.extras import missing_module

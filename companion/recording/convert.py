@@ -36,7 +36,7 @@ from companion.bus.topics import (
     VEHICLE,
     Topic,
 )
-from companion.peer_data import parse_object
+from companion.host.peer_data import parse_object
 from companion.recording.files import Channel, Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
 from companion.recording.link_bytes import unpack_link_bytes

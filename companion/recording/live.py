@@ -16,7 +16,7 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 
 from companion.bus.client import message_of, open_client
 from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS, Topic
-from companion.passing import AddressTakenError
+from companion.host.passing import AddressTakenError
 from companion.recording import RecordingError
 from companion.recording.convert import Converter, large_channel
 from companion.recording.files import Channel

@@ -12,14 +12,14 @@ from typing import Any
 from companion.bus.bodies.service import CommandStateBody
 from companion.bus.command_intake import Allowance
 from companion.bus.topics import command_id
-from companion.clock import boottime_ns
 from companion.guidance.behaviour import Outcome
 from companion.guidance.behaviours.select import Select
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command import COMMANDS, GrammarError
 from companion.guidance.interface import CommandInput, CommandResult
 from companion.guidance.missions.sequence import SequenceBehaviour
-from companion.load import with_load
+from companion.host.clock import boottime_ns
+from companion.host.load import with_load
 from vision.tracking import Selected
 
 # Commands reported as events: so many a second, and so many at once, which is more than a person sends.

@@ -15,8 +15,8 @@ import stat
 from collections.abc import Callable, Coroutine
 from typing import TypeVar
 
-from companion.journal import is_journal
-from companion.tasks import spawn
+from companion.host.journal import is_journal
+from companion.host.tasks import spawn
 
 _T = TypeVar("_T")
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

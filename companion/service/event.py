@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from companion.bus.bodies.service import EventBody
-from companion.load import with_load
+from companion.host.load import with_load
 from vision.redaction import redacted
 
 logger = logging.getLogger(__package__)

@@ -12,12 +12,12 @@ from typing import Any
 from companion.bus.client import NoAnswerError, settings_for_child
 from companion.bus.config import BusError
 from companion.bus.topics import IMAGE
-from companion.child_process import child_process
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
+from companion.host.child_process import child_process
 from companion.perception.cameras import recorded_frames_names
 from companion.recording import LISTENING, PAUSED, RECORDED, RECORDING
 from companion.settings import CameraSection, Settings

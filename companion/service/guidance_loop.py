@@ -11,11 +11,11 @@ from collections.abc import Callable
 from typing import Any
 
 from companion.bus.bodies.service import CommandStateBody
-from companion.clock import Standstill
 from companion.guidance.core import Guidance
 from companion.guidance.gimbal.controller import ENDING
 from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutput, StreamStatus
 from companion.guidance.mode_control import Phase
+from companion.host.clock import Standstill
 from companion.recording.guidance_record import StepContext
 from companion.service.command_handler import CommandHandler
 from companion.service.inputs import InputAssembler

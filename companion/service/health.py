@@ -7,11 +7,11 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeVar
 
 from companion.guidance.core import Guidance
+from companion.host.tasks import keep_running
 from companion.perception.cameras import WorkerCamera
 from companion.service.inputs import InputAssembler
 from companion.service.other_commanders import OtherCommanders
 from companion.service.systemd_notify import SystemdNotifier
-from companion.tasks import keep_running
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, parameter_names
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.setpoint_loss import SetpointLossOutcome, setpoint_loss_outcome

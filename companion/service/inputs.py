@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from companion.clock import Standstill
 from companion.guidance.behaviour import Behaviour
 from companion.guidance.behaviours.select import FIRST_CAMERA, Select
 from companion.guidance.command import BuildContext, Command, GrammarError
@@ -21,14 +20,15 @@ from companion.guidance.interface import Answer, CommandInput, CommandSource, Gu
 from companion.guidance.objects.from_detections import StateHistory
 from companion.guidance.objects.from_markers import NO_MARKERS, LocalizedMarkers
 from companion.guidance.search_pattern import Footprint
+from companion.host.clock import Standstill
 from companion.perception.cameras import PerceptionCamera
 from companion.perception.freeze_reports import FreezeReports
 from companion.perception.marker_tracker import MarkerTracker
-from companion.plugins import load_plugins
 from companion.recording.guidance_record import StepContext
 from companion.service.autopilot_reports import AutopilotReports
 from companion.service.velocity_senders import VelocitySenders
 from companion.settings import CameraSection, Settings
+from companion.settings.plugins import load_plugins
 from companion.vehicle.autopilot_parameters import NOTHING_READ
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from companion.bus.bodies.service import OtherCommanderBody
 from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
-from companion.peer_data import PeerDataError, parse_object
+from companion.host.peer_data import PeerDataError, parse_object
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.gimbal import Address, address_text
 from companion.vehicle.setpoint_loss import SetpointLossEffect, SetpointLossOutcome

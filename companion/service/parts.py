@@ -13,12 +13,12 @@ from dataclasses import replace
 
 from companion.bus.bodies.service import PartBody
 from companion.bus.session import Bus
+from companion.host.tasks import error_text, start_together
 from companion.perception.cameras import WorkerCamera
 from companion.perception.supervisor import PerceptionStartError, PerceptionUnavailableError
 from companion.service.part import Part, PartState, part_of_camera
 from companion.settings.perception import NO_SOURCE
 from companion.settings.vehicle import VehicleSection
-from companion.tasks import error_text, start_together
 from companion.vehicle.driver import Driver, LinkError, LinkUnavailableError
 
 logger = logging.getLogger(__package__)

@@ -20,7 +20,7 @@ from companion.guidance.interface import (
     TakeGimbal,
     TakeOff,
 )
-from companion.tasks import spawn
+from companion.host.tasks import spawn
 from companion.vehicle.driver import CommandRefusedError, Driver, LinkError, TakenOverError
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.state import VehicleState

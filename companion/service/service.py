@@ -19,6 +19,7 @@ from companion.bus.session import Bus
 from companion.bus.status_message import status_message
 from companion.guidance.core import Guidance
 from companion.guidance.grammar import describe
+from companion.host.tasks import keep_running, run_until
 from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
 from companion.perception.cameras import WorkerCamera, open_cameras
@@ -35,7 +36,6 @@ from companion.service.publisher import Publisher, localization_of
 from companion.service.queries import Queries
 from companion.service.systemd_notify import SystemdNotifier
 from companion.settings import Settings
-from companion.tasks import keep_running, run_until
 from companion.vehicle.driver import Driver
 from companion.vehicle.state import VehicleState
 from vision.pipeline import PerceptionResult

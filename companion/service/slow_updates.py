@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from companion.load import busy_text
+from companion.host.load import busy_text
 
 # A longer step delays the setpoints of the 50 Hz stream: processor time, and wall-clock time (larger, because
 # other programs may have the processor).

@@ -8,7 +8,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from companion.bus.bodies.vehicle import VelocityBody
 from companion.guidance.behaviour import VelocityInput
-from companion.peer_data import PeerDataError, parse_object
+from companion.host.peer_data import PeerDataError, parse_object
 from companion.vehicle.clock_sync import SenderDelay
 
 MAX_LIFETIME_S = 0.5

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from companion.toml_text import parse_toml
+from companion.settings.toml_text import parse_toml
 from vision.file_kinds import explained
 from vision.marker_boards import MAP, Board, ned_from_marker
 from vision.markers import square

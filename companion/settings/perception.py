@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, model_validator
 from companion.settings.marker_files import Print, read_boards, read_map
 from companion.settings.section import Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
-from vision.calibration.camera_info import read_camera_info, read_registration
+from vision.calibration_files.camera_info import read_camera_info, read_registration
 from vision.camera_model import (
     CameraModel,
     CameraMount,

@@ -31,7 +31,7 @@ from companion.settings.fields import (
 )
 from companion.settings.section import Section
 from companion.settings.settings import Settings
-from companion.toml_text import parse_toml
+from companion.settings.toml_text import parse_toml
 from vision.file_kinds import explained
 from vision.redaction import redacted
 from vision.text_file import read_text

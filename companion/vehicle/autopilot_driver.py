@@ -19,8 +19,8 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from companion.clock import StandstillWatch
-from companion.tasks import keep_running, spawn
+from companion.host.clock import StandstillWatch
+from companion.host.tasks import keep_running, spawn
 from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.autopilot_profile import POSITION_TARGET_ID, AutopilotProfile, Px4Profile
 from companion.vehicle.byte_link import ByteLink, Source, open_link

@@ -18,8 +18,8 @@ import tty
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from companion.clock import boottime_ns
-from companion.tasks import keep_running, spawn
+from companion.host.clock import boottime_ns
+from companion.host.tasks import keep_running, spawn
 from companion.vehicle.driver import LinkError, LinkUnavailableError
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 

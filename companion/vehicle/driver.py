@@ -10,8 +10,8 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Protocol
 
-from companion.clock import StandstillWatch
-from companion.passing import PassingError
+from companion.host.clock import StandstillWatch
+from companion.host.passing import PassingError
 from companion.vehicle.autopilot_parameters import FirmwareVersion
 from companion.vehicle.gimbal import Address, GimbalAim
 from companion.vehicle.landing_target import LandingTarget

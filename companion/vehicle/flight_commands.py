@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Awaitable, Callable
 
-from companion.tasks import spawn
+from companion.host.tasks import spawn
 from companion.vehicle.autopilot_profile import HOME_POSITION_ID
 from companion.vehicle.driver import CommandRefusedError, TakenOverError
 from companion.vehicle.mav_result import result_name

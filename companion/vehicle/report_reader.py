@@ -24,7 +24,7 @@ from typing import Annotated, NamedTuple, NotRequired, TypeVar
 from pydantic import Field, TypeAdapter, ValidationError
 from typing_extensions import TypedDict
 
-from companion.peer_data import PeerDataError, check_size
+from companion.host.peer_data import PeerDataError, check_size
 from companion.vehicle.framing import (
     COMPONENT_METADATA_ID,
     CURRENT_EVENT_SEQUENCE_ID,

@@ -36,7 +36,7 @@ class Setpoint:
 
     Attributes:
         deadline_ns: after which it must not be sent: CLOCK_MONOTONIC nanoseconds, compared with a clock that
-            counts a suspend (`companion.clock`).
+            counts a suspend (`companion.host.clock`).
         position_ned_m: metres, local NED.
         velocity_ned_mps: metres a second, local NED.
         acceleration_ned_mps2: feed-forward of a velocity setpoint, m/s², local NED: PX4 adds it to the output

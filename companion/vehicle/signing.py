@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from companion.key_files import KeyFileError, check_private
+from companion.settings.key_files import KeyFileError, check_private
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import MAGIC_V2, SIGNATURE_LENGTH, Frame, is_signed, marked_signed
 from vision.file_kinds import kind_of_bytes, open_file

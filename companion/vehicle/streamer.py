@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from enum import StrEnum
 
-from companion.scheduling import set_scheduler_slice
+from companion.host.scheduling import set_scheduler_slice
 from companion.vehicle.precise_sleep import Sleep, precise_sleep
 from companion.vehicle.setpoint import Setpoint
 

@@ -20,7 +20,7 @@ import typer
 from numpy.typing import NDArray
 
 from vision.calibration.boards import Board
-from vision.calibration.camera_info import read_camera_info, write_camera_info
+from vision.calibration_files.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
 from vision.rotation import matrix_from_euler

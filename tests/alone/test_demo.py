@@ -10,9 +10,9 @@ from pathlib import Path
 import cv2
 import pytest
 
-from companion.demo import _CAMERA_RATE_HZ
 from companion.guidance.missions.mission_file import MISSIONS_FOLDER
-from companion.sim_session import MISSION
+from companion.simulation.demo import _CAMERA_RATE_HZ
+from companion.simulation.session import MISSION
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.command_line import QUICK
 from tests.companion.plain_installation import environment_without
@@ -34,7 +34,7 @@ QUICKER_FLIGHT = {
     "MPC_Z_VEL_MAX_DN": 3.0,
 }
 QUICK_DEMO = f"""
-from companion import demo
+from companion.simulation import demo
 from mavlink_sim.testing import QUICK_FLIGHT
 demo._CAMERA_RATE_HZ /= {FEWER}
 QUICK_FLIGHT.update({QUICKER_FLIGHT})

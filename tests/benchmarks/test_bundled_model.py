@@ -13,7 +13,7 @@ from mavlink_sim.camera import ground_view
 from mavlink_sim.camera.scene_file import example_scenes
 from mavlink_sim.world.shapes import CLASS_NAMES
 from mavlink_sim.world.textures import mip_atlas
-from vision.yolo.metrics import ImageResult
+from vision.evaluation.metrics import ImageResult
 
 
 def test_recall_counts_evaluated_objects_found_as_their_class() -> None:

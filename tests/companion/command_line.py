@@ -16,9 +16,10 @@ from companion.cli.commands import app
 COLUMNS = {"COLUMNS": "200", "NO_COLOR": "1"}
 # `companion`, whose simulated vehicles take off and land quickly: for `python -c`.
 QUICK = """
-from companion import cli, sim_session
+from companion import cli
+from companion.simulation import session
 from mavlink_sim.testing import QUICK_FLIGHT
-sim_session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
+session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
 cli.main()
 """
 

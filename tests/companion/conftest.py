@@ -76,7 +76,7 @@ def exported_model(small_model: Path, tmp_path_factory: pytest.TempPathFactory) 
         pytest.importorskip(package, reason=f"{package} is an optional extra")
 
     def make(path: Path) -> None:
-        from vision.runtimes.export import export
+        from vision.exports.export import export
 
         export(small_model, "onnx", path, 160, model_family="YOLOv8")
 

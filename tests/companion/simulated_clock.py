@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import pytest
 
-from companion.clock import StandstillWatch
+from companion.host.clock import StandstillWatch
 
 _T = TypeVar("_T")
 _real_ns = time.monotonic_ns
@@ -74,7 +74,7 @@ def run_simulated(
     """Run a coroutine in a loop of its own, on a simulated clock."""
     monkeypatch.setattr(time, "monotonic", clock.now_s)
     monkeypatch.setattr(time, "monotonic_ns", clock.now_ns)
-    monkeypatch.setattr("companion.clock.boottime_ns", clock.now_ns)
+    monkeypatch.setattr("companion.host.clock.boottime_ns", clock.now_ns)
     monkeypatch.setattr(StandstillWatch.__init__, "__defaults__", (clock.now_ns, clock.now_ns))
     with asyncio.Runner(loop_factory=lambda: _Loop(clock)) as runner:
         return runner.run(work)

@@ -21,7 +21,7 @@ from companion.guidance.behaviour import Behaviour
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.grammar import json_schema, parse, usage
 from companion.guidance.objects.tracked_object import Subject
-from companion.plugins import load_plugins
+from companion.settings.plugins import load_plugins
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.test_circle_plugin import installed_package
 from vision.camera_model import CameraModel, CameraMount

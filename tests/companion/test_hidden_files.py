@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.flight_log import summaries
+from companion.logs.flight_log import summaries
 from vision.model_files import kept_models
 from vision.runtimes.source import read_source
 

@@ -16,7 +16,7 @@ import pytest
 
 from companion.bus.config import BusError
 from companion.bus.session import encode
-from companion.journal import log_to_standard_error
+from companion.host.journal import log_to_standard_error
 from companion.language.endpoints import LanguageError
 from companion.perception.messages import LogLine, ResultLogHandler
 from companion.service.event import EventLog

@@ -16,7 +16,7 @@ import pytest
 
 from mavlink_sim.wire.messages import dialect
 from tests.companion.command_line import companion
-from tests.companion.test_play import playing
+from tests.companion.simulation.test_play import playing
 from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import FIGURES, NAMES, OFFBOARD, PX4, READY_S, AutopilotLink, Flight, bring_down
 

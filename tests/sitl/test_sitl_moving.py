@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.companion.test_play import playing
+from tests.companion.simulation.test_play import playing
 from tests.sitl.conftest import Services
 from tests.sitl.sitl_harness import AutopilotLink, Flight, bring_down
 from tests.sitl.test_sitl_demo import make_ready

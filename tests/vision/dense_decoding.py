@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from vision.training.losses import cell_grid
 from vision.yolo.architecture import YoloModel
-from vision.yolo.losses import cell_grid
 
 
 def decoded(model: YoloModel, maps: Sequence[Tensor]) -> Tensor:

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.evaluate import map_classes
 from companion.guidance.behaviours.patrol import Patrol
 from companion.guidance.command import GrammarError
 from companion.guidance.grammar import parse
 from companion.language.nouns import classes_of
 from companion.language.tools import ToolCall, read_call
+from companion.learning.evaluate import map_classes
 from companion.settings import Settings
 from mavlink_sim.camera.scene_file import parse_scene
 from vision.class_names import class_named, fold_name, joined_names

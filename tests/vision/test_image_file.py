@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from vision.evaluation.datasets import DatasetError, image_files
 from vision.evaluation.datasets import read_image as read_labelled
+from vision.exports.quantize import FEWEST_IMAGES, calibration_images
 from vision.image_file import ImageError, decode, decode_image, read_image
-from vision.runtimes.quantize import FEWEST_IMAGES, calibration_images
 from vision.sources import SourceError, open_source
 
 GREY = np.tile(np.linspace(0, 255, 64).round().astype(np.uint8), (48, 1))

@@ -23,13 +23,13 @@ from tests.vision.foreign_checkpoints import (
 )
 from tests.vision.runtimes.conftest import make_image, needs, small_description
 from vision.detector import Detector
+from vision.exports.export import export
 from vision.foreign.layouts import TASKS
 from vision.runtimes.base import RuntimeUnusableError
-from vision.runtimes.export import export
 from vision.runtimes.network import Network
 from vision.runtimes.source import runtime_of_file
+from vision.training.fine_tuning import extend_classes
 from vision.yolo.architecture import ArchitectureError, build
-from vision.yolo.fine_tuning import extend_classes
 from vision.yolo.heads import OBB
 from vision.yolo.published import published_description
 

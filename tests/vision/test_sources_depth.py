@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from vision.calibration.camera_info import write_camera_info
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
 from vision.frame import Frame

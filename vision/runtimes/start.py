@@ -68,7 +68,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     """The checkpoint's network as a file for another runtime, converted once and cached."""
     import torch
 
-    from vision.runtimes.export import export_network
+    from vision.runtimes.conversion import convert_network
 
     assert source.description is not None
     kind = _EXPORTS[name]
@@ -93,7 +93,7 @@ def _converted(source: ModelSource, network: Network, name: RuntimeName, image_s
     try:
         if not path.is_file():
             logger.info("converting %s for %s, once; cached at %s", source.path.name, name, path)
-            export_network(network, facts, kind, path)
+            convert_network(network, facts, kind, path)
     except OSError as error:
         raise RuntimeUnusableError(
             f"{path}: the converted network cannot be cached ({error.strerror}); "

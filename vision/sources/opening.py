@@ -14,7 +14,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from vision.calibration.camera_info import read_registration
+from vision.calibration_files.camera_info import read_registration
 from vision.home import expanded
 from vision.image_file import is_image
 from vision.redaction import HIDDEN, without_password

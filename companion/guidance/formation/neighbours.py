@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from companion.guidance.formation.pose import FormationNote, Pose, pose_from_message, pose_of
-from companion.peer_data import parse_object
+from companion.host.peer_data import parse_object
 from companion.vehicle.clock_sync import SenderDelay
 from companion.vehicle.global_position import Anchor, global_problem
 from companion.vehicle.state import Vector3, VehicleState

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
 
 from companion.geometry.formation import SHAPES
-from companion.peer_data import PeerDataError
+from companion.host.peer_data import PeerDataError
 from companion.vehicle.global_position import global_problem
 from companion.vehicle.state import LandedState, VehicleState
 from vision.attitude import euler_from_quaternion

@@ -45,7 +45,7 @@ from companion.guidance.missions.sequence import (
     SequenceBehaviour,
 )
 from companion.guidance.search_pattern import Footprint
-from companion.toml_text import parse_toml
+from companion.settings.toml_text import parse_toml
 from vision.class_names import near_names
 from vision.file_kinds import explained, kind_of_text
 from vision.text_file import read_text

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from companion.bench.bus import _LOADING_S, _START_S, _detections, measure_bus, measure_recovery
+from companion.host.scheduling import DEFAULT_NS, set_scheduler_slice
 from companion.perception.process import PerceptionProcess
-from companion.scheduling import DEFAULT_NS, set_scheduler_slice
 from companion.settings import Settings
 from tests.companion.bus.message_check import check_message
 from tests.companion.command_line import companion_here

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from companion.bus import topics
 from companion.bus.listeners import BATCH, MAX_WAITING, WARN_INTERVAL_S, Listener, ListenerQueue
-from companion.peer_data import MAX_DEPTH, PeerDataError, parse_json
+from companion.host.peer_data import MAX_DEPTH, PeerDataError, parse_json
 from companion.service.service import Service
 from companion.settings import Settings
 

@@ -393,16 +393,16 @@ def test_echo_of_unknown_topic_lists_topics(tmp_path: Path) -> None:
 
 _DEMO_THAT_SAYS_MUCH = """
 import sys
-import companion.demo
+import companion.simulation.demo
 from companion.cli import main
 
 def flight(output, *, say, **_):
     for _ in range(400):
         say("x" * 1000)
-    values = dict.fromkeys(companion.demo.Summary.__dataclass_fields__)
-    return companion.demo.Summary(**{**values, "success": False, "failure": "flown"})
+    values = dict.fromkeys(companion.simulation.demo.Summary.__dataclass_fields__)
+    return companion.simulation.demo.Summary(**{**values, "success": False, "failure": "flown"})
 
-companion.demo.run_demo = flight
+companion.simulation.demo.run_demo = flight
 sys.argv = ["companion", "demo"]
 main()
 """

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from companion.passing import EXIT_PASSING
+from companion.host.passing import EXIT_PASSING
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion
 

@@ -51,7 +51,7 @@ from tests.companion.source_kinds import (
     Given,
     written_to_standard_input,
 )
-from vision.calibration.camera_info import write_camera_info
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
 
 pytestmark = pytest.mark.realtime
@@ -253,7 +253,7 @@ OF_THE_TASK = {
     "--board", "--square", "--name", "--output", "--colour-calibration", "--infrared-calibration",
     "--calibration",
 }  # fmt: skip
-# They need images of a board: tests/companion/test_calibrate_command.py.
+# They need images of a board: tests/companion/camera_tools/test_calibrate_command.py.
 WITH_A_BOARD = {
     "calibrate lens --report", "calibrate lens --every", "calibrate lens --rotate", "calibrate lens --mirror",
     "calibrate extrinsics --every", "calibrate extrinsics --rotate", "calibrate extrinsics --mirror",
@@ -346,7 +346,8 @@ def test_an_option_works_with_a_kind_of_source(
 ) -> None:
     kind = request.node.callspec.params["given"]
     monkeypatch.setattr(
-        "companion.preview.attitudes_of", lambda _settings: contextlib.nullcontext(level_vehicle())
+        "companion.camera_tools.preview.attitudes_of",
+        lambda _settings: contextlib.nullcontext(level_vehicle()),
     )
     lens = CameraModel(WIDTH, HEIGHT, 300.0, 300.0, WIDTH / 2, HEIGHT / 2)
     write_camera_info(tmp_path / "camera.yaml", lens, "camera")

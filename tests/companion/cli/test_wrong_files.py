@@ -24,7 +24,7 @@ from companion.recording.files import write_messages
 from companion.settings.reading import flags
 from mavlink_sim.camera.scene_file import SceneError, load_scene
 from tests.companion.command_line import companion_here
-from vision.calibration.camera_info import write_camera_info
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
 from vision.weights import DEFAULT_EXPORT
 

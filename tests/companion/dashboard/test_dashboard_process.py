@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from companion.dashboard.server import NICENESS
-from companion.passing import EXIT_PASSING
+from companion.host.passing import EXIT_PASSING
 from mavlink_sim.testing import free_port
 from tests.companion.command_line import companion, companion_here
 from tests.companion.dashboard.serving import dashboard_command
 from tests.companion.service_process import ServiceProcess
-from tests.companion.test_play import descendants
+from tests.companion.simulation.test_play import descendants
 
 pytestmark = pytest.mark.realtime
 

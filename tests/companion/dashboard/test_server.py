@@ -19,7 +19,7 @@ from companion.bus.topics import DETECTIONS, VEHICLE, command_key
 from companion.dashboard.access import COOKIE, DashboardError
 from companion.dashboard.connections import MAX_ANSWERED
 from companion.dashboard.server import LARGEST_BODY_BYTES, MAX_STREAMS_PER_BROWSER
-from companion.passing import AddressTakenError
+from companion.host.passing import AddressTakenError
 from tests.companion.dashboard.serving import POST, EventStream, request, serving
 from tests.companion.dashboard.test_bridge import NAME, frame, publishing, until
 

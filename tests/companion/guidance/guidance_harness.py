@@ -11,7 +11,6 @@ from types import MappingProxyType
 from typing import Any, TypeVar
 
 from companion.bench.lockstep_flight import LockstepFlight, vehicle_in_the_air
-from companion.clock import StandstillWatch
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput, Outcome
 from companion.guidance.command import NO_CONTEXT
 from companion.guidance.core import Guidance, GuidanceOptions
@@ -41,6 +40,7 @@ from companion.guidance.mode_control import Phase
 from companion.guidance.objects.from_markers import object_detections
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import Target
+from companion.host.clock import StandstillWatch
 from companion.service.requests import apply_output
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame
 from companion.vehicle.landing_target import LandingTarget

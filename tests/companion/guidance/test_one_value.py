@@ -22,13 +22,13 @@ from companion.bus.topics import DETECTIONS, MARKERS, RUN, TRACKS, Topic
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.objects.in_view import ObjectsInView
 from companion.guidance.objects.tracked_object import Subject, TrackedObject
+from companion.logs.replay import replay
 from companion.perception.cameras import PerceptionCamera
 from companion.recording.convert import INPUT_CHANNEL, Converter
 from companion.recording.encoding import dumps, encode
 from companion.recording.files import RecordingReader
 from companion.recording.guidance_record import read_step
 from companion.recording.tap import run_record
-from companion.replay import replay
 from companion.service.publisher import Publisher, localization_of
 from companion.vehicle.landing_target import LandingTarget
 from tests.companion.bus.message_check import check_message

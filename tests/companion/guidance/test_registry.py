@@ -11,7 +11,7 @@ import pytest
 import vision.detector  # noqa: F401  (registers its kinds of detectors)
 from companion.guidance.command import COMMANDS, NO_CONTEXT
 from companion.guidance.grammar import describe, json_schema, markdown, parse
-from companion.plugins import PluginError, load_plugins
+from companion.settings.plugins import PluginError, load_plugins
 
 PLUGIN = """
 from typing import Annotated

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from companion.bench.lockstep_flight import plain_settings
+from companion.host.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from companion.language.process import NICENESS, AskProcess
-from companion.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from tests.companion.cli.test_ask import Service, service
-from tests.companion.test_play import descendants
+from tests.companion.simulation.test_play import descendants
 from tests.companion.vehicle.thread_slice import slice_of
 
 pytestmark = pytest.mark.realtime

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from companion.bus.client import listen
+from companion.host.passing import AddressTakenError
 from companion.operator.metrics import MetricsError, MetricsServer
 from companion.operator.wsgi_server import MAX_CONNECTIONS
-from companion.passing import AddressTakenError
 from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
 

@@ -14,7 +14,7 @@ import pytest
 from companion.perception.messages import Begin
 from companion.perception.worker import _open
 from companion.settings.reading import load_settings
-from vision.calibration.camera_info import write_camera_info
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
 from vision.sources import SourceError
 

@@ -6,7 +6,7 @@ import os
 
 import pytest
 
-from companion.config_check import check_settings
+from companion.cli.config_check import check_settings
 from companion.perception.cameras import WorkerCamera
 from companion.settings.reading import load_settings
 from vision.camera_model import CameraCalibration, CameraModel

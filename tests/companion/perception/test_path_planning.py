@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from companion.clock import StandstillWatch
+from companion.host.clock import StandstillWatch
 from companion.perception.path_planning import PathPlanning, PositionHistory
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.settings.reading import load_settings

@@ -9,9 +9,9 @@ from collections.abc import Callable
 
 import pytest
 
+from companion.host.restarts import LATER_S
 from companion.perception.messages import StartFailed
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
-from companion.restarts import LATER_S
 from companion.settings.reading import load_settings
 from tests.companion.perception.scripted_worker import LOADING_S, ScriptedWorker
 from tests.companion.simulated_clock import SimulatedClock, run_simulated

@@ -19,10 +19,10 @@ import cv2
 import numpy as np
 import pytest
 
+from companion.host.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from companion.perception.standard_input import StandardInput
 from companion.perception.supervisor import PerceptionStartError, PerceptionState, PerceptionSupervisor
 from companion.perception.worker import NICENESS
-from companion.scheduling import DEFAULT_NS, SHORTEST_NS, set_scheduler_slice
 from companion.settings.reading import Settings, load_settings
 from tests.companion.vehicle.thread_slice import slice_of
 from vision.pipeline import PerceptionResult

@@ -24,7 +24,7 @@ from companion.bus.messages import (
 from companion.bus.topics import RECORDER_TOPICS, TOPICS
 from companion.bus.vehicle_messages import vehicle_message
 from companion.guidance.core import GuidanceOptions
-from companion.peer_data import PeerDataError
+from companion.host.peer_data import PeerDataError
 from companion.recording.convert import Converter
 from companion.recording.encoding import dumps
 from companion.recording.files import Recorded

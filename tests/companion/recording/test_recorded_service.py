@@ -20,8 +20,8 @@ import jsonschema
 import pytest
 from pymavlink import mavutil
 
+from companion.logs.replay import replay
 from companion.recording.files import RecordingReader
-from companion.replay import replay
 from mavlink_sim.testing import running_simulator
 from tests.companion.recording.lockstep_recording import library_times
 from tests.companion.service_process import TWICE, ServiceProcess, heartbeats, running_service

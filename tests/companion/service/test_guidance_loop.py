@@ -11,10 +11,10 @@ from typing import Any
 
 import pytest
 
-from companion.clock import Standstill, StandstillWatch
 from companion.guidance.behaviour import BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.interface import GuidanceInput, StreamStatus
+from companion.host.clock import Standstill, StandstillWatch
 from companion.service import guidance_loop
 from companion.service.guidance_loop import GuidanceLoop
 from companion.vehicle.precise_sleep import Sleep

@@ -16,7 +16,7 @@ from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.interface import CommandInput
-from companion.peer_data import PeerDataError
+from companion.host.peer_data import PeerDataError
 from companion.service.other_commanders import FOREIGN_OFFBOARD, FOREIGN_SETPOINTS, OtherCommanders
 from companion.settings.vehicle import VehicleSection
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters, FirmwareVersion

@@ -5,8 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import cast
 
-from companion.clock import StandstillWatch
 from companion.guidance.interface import Arm, FindGimbal, Request, SetMode
+from companion.host.clock import StandstillWatch
 from companion.service.requests import RequestRunner
 from companion.vehicle.driver import CommandRefusedError, Driver
 from companion.vehicle.state import FlightMode, VehicleState

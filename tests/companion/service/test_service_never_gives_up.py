@@ -88,7 +88,7 @@ CASES = {
     "end of a worker": Case(
         "companion.perception.supervisor:PerceptionSupervisor._selection_ended", "camera"
     ),
-    "recorder": Case("companion.child_process:_run_once", "recorder"),
+    "recorder": Case("companion.host.child_process:_run_once", "recorder"),
     "steps for the recorder": Case("companion.recording.tap:FlightTap._publish"),
 }
 

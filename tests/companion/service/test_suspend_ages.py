@@ -13,11 +13,11 @@ import pytest
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.bus.vehicle_messages import pose_message
-from companion.clock import StandstillWatch
 from companion.guidance.core import Guidance
 from companion.guidance.formation.pose import Pose
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
 from companion.guidance.mode_control import Phase
+from companion.host.clock import StandstillWatch
 from companion.perception.cameras import PerceptionCamera
 from companion.service import command_handler, guidance_loop
 from companion.service.guidance_loop import GuidanceLoop

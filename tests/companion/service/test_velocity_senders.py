@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from companion.peer_data import PeerDataError
+from companion.host.peer_data import PeerDataError
 from companion.service.velocity_senders import FORGET_S, MAX_SENDERS, VelocitySenders
 
 S = 1_000_000_000

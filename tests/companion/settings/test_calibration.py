@@ -12,7 +12,7 @@ import pytest
 from companion.settings.calibration import adopt_calibration
 from companion.settings.perception import CameraSection
 from companion.settings.reading import ConfigurationError, load_settings, to_toml
-from vision.calibration.camera_info import write_camera_info
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 from vision.orientation import Orientation
 

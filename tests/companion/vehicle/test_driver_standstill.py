@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from companion.clock import StandstillWatch, boottime_ns
+from companion.host.clock import StandstillWatch, boottime_ns
 from companion.vehicle.autopilot_driver import AutopilotDriver
 from companion.vehicle.driver import CommandRefusedError, Driver, SystemStatus
 from companion.vehicle.setpoint import Setpoint

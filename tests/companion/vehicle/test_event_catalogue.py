@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.peer_data import PeerDataError
+from companion.host.peer_data import PeerDataError
 from companion.vehicle.report import ALL_MODES, Report
 from companion.vehicle.report_reader import LARGEST_UNPACKED, Event, EventCatalogue
 

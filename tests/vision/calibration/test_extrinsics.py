@@ -12,8 +12,8 @@ import pytest
 from mavlink_sim.datasets.board_views import LENSES, BoardPose, board_pairs, random_rig
 from vision.calibration.boards import Board, BoardView
 from vision.calibration.calibrate import CalibrationError
-from vision.calibration.camera_info import read_camera_info, read_registration, write_camera_info
 from vision.calibration.extrinsics import extrinsics_from_views
+from vision.calibration_files.camera_info import read_camera_info, read_registration, write_camera_info
 from vision.camera_model import CameraModel
 from vision.depth_registration import DepthCalibration
 from vision.orientation import Orientation

@@ -18,9 +18,9 @@ import pytest
 from tests.vision.runtimes.conftest import make_image, needs
 from vision.detections import Detections
 from vision.detector import Detector
+from vision.exports.export import export
 from vision.runtimes import autotune, base, stored_choice
 from vision.runtimes.base import RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
-from vision.runtimes.export import export
 from vision.runtimes.selection import start_runtime
 from vision.runtimes.source import read_source, runtime_of_file
 from vision.runtimes.stored_choice import cache_folder, forget_choices

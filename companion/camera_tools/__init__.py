@@ -1,0 +1,1 @@
+"""Commands that look through a camera without flying: detect, preview, markers, calibrate."""

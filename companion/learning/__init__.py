@@ -1,0 +1,1 @@
+"""Learning and its data: collected frames, training, evaluation, policies."""

@@ -1,0 +1,1 @@
+"""What reads recordings: replay, the log of a flight, sightings, recorded frames."""

@@ -1,0 +1,1 @@
+"""The service with the simulated vehicle: `play`, `demo`, and campaigns of seeds."""

@@ -1,0 +1,1 @@
+"""Files of a calibration: those of ROS, Kalibr and OpenCV are read, one is written."""
