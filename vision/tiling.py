@@ -1,7 +1,7 @@
 """Small objects in large frames: detection in overlapping tiles, and once in the whole frame.
 
 A network's input is 640 pixels wide; a 1920-pixel frame is shrunk threefold for it, and a ten-pixel object
-with it. Tiles are not shrunk. Every tile costs as much as a frame (`docs/models.md` has the figures): use it
+with it. Tiles are not shrunk. Every tile costs as much as a frame (figures: `docs/measurements.md`): use it
 at high altitude where latency matters less. Slicing follows SAHI (Akyon et al., 2022, arXiv:2202.06934);
 boxes cut by a tile's edge are marked here, so that a whole box is never suppressed by a partial one.
 """

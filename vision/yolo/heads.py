@@ -139,7 +139,7 @@ class OBB(Detect):
 
     def sides(self, level: int, x: Tensor) -> Tensor:
         # torch computes this in float32 whatever the network's precision: a distance needs more digits than a
-        # logit. OpenVINO in bfloat16 does not keep all of it in float32 (figures: docs/models.md).
+        # logit. OpenVINO in bfloat16 does not keep all of it in float32 (figures: docs/measurements.md).
         logits = super().sides(level, x).float().permute(0, 2, 3, 1)
         left, top, right, bottom = self.dfl(logits).unbind(dim=-1)
         angle = (self.cv4[level](x).float().squeeze(1).sigmoid() - 0.25) * math.pi
