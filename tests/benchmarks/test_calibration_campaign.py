@@ -1,4 +1,4 @@
-"""Lenses and mounts calibrated from rendered images, within the errors of docs/how-to/calibrate.md."""
+"""Lenses and mounts calibrated from rendered images, within the errors of docs/measurements.md."""
 
 from __future__ import annotations
 
