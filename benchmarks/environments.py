@@ -1,6 +1,6 @@
 """The environments: error of the fast model against the whole autopilot, and steps per second.
 
-`python -m benchmarks.environments` prints both tables of `docs/how-to/environments.md`.
+`python -m benchmarks.environments` prints the rows of the environments in `docs/measurements.md`.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 The rigid body, the rotors, the mixer, the attitude loop and the velocity loop are those of
 `physics.airframe` and `flight.position_control`, with their constants, in steps of 12.5 ms instead of 4 and
 12 ms. Left out: the ground, an estimate's errors, the hold of a heading between turns, and the state machine
-around them. `docs/how-to/environments.md` has the error against the whole autopilot.
+around them. `docs/measurements.md` has the error against the whole autopilot.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from vision.point_cloud.cloud import PointCloud
 Method = Literal["icp", "plane_icp", "gicp"]
 MIN_POINTS = 20
 # Chosen on 16 pairs of rendered views of each of 3 scenes (`benchmarks.cloud_alignment`, seeds 500 to 515):
-# those above were within 0.03 m, those below up to 0.45 m off. Others are in docs/how-to/point-clouds.md.
+# those above were within 0.03 m, those below up to 0.45 m off. Others are in docs/measurements.md.
 MIN_OBSERVABILITY: dict[Method, float] = {"plane_icp": 0.02, "gicp": 0.004}
 
 
