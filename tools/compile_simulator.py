@@ -21,7 +21,13 @@ import mavlink_sim
 
 # Half of a step's time; more modules gain little. `LockstepVehicle.copy` pickles the vehicle: a subclass of a
 # compiled class that is not compiled loses its own attributes there (`CollidingMultirotor`, of a scene).
-MODULES = ("physics/airframe.py", "physics/estimate_errors.py", "flight/position_control.py")
+MODULES = (
+    "physics/airframe.py",
+    "physics/rotor_control.py",
+    "physics/rotations.py",
+    "physics/estimate_errors.py",
+    "flight/position_control.py",
+)
 _FUTURE = "from __future__ import annotations\n"
 _CLASS = re.compile(r"^class ", re.MULTILINE)
 # Otherwise a compiled class is neither pickled nor a base of one that is not compiled.

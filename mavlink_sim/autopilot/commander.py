@@ -23,8 +23,9 @@ from mavlink_sim.flight.position_control import Demand, PositionController, Traj
 from mavlink_sim.flight.precision_landing import Precision
 from mavlink_sim.flight.tasks import Reposition, reposition_goal
 from mavlink_sim.missions.navigator import Navigator
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import (
     MANUAL_MODES,
     MODES_PREVENTING_ARMING,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 

@@ -19,23 +19,25 @@ from mavlink_sim.flight.position_control import ANTI_WINDUP, LEAST_LIFT_MPS2, MO
 from mavlink_sim.physics.airframe import (
     ANGULAR_DRAG_NMS,
     ARM_M,
-    ATTITUDE_GAIN_PER_S,
     GRAVITY_MPS2,
     GUST_TIME_CONSTANT_S,
     LINEAR_DRAG_PER_S,
     MAX_THRUST_MPS2,
+    ROTOR_THRUST_MPS2,
+    ROTOR_TIME_CONSTANT_S,
+    ROTOR_TORQUE_NM,
+)
+from mavlink_sim.physics.contact import INERTIA_XY_KGM2, INERTIA_Z_KGM2
+from mavlink_sim.physics.rotor_control import (
+    ATTITUDE_GAIN_PER_S,
     MAX_TILT_RATE_RADPS,
     RATE_D,
     RATE_DRAG,
     RATE_P,
-    ROTOR_THRUST_MPS2,
-    ROTOR_TIME_CONSTANT_S,
-    ROTOR_TORQUE_NM,
     YAW_MARGIN,
     YAW_RATE_DRAG,
     YAW_RATE_P,
 )
-from mavlink_sim.physics.contact import INERTIA_XY_KGM2, INERTIA_Z_KGM2
 from mavlink_sim.px4.parameters import Parameters
 
 SUBSTEPS = 4

@@ -26,8 +26,8 @@ from mavlink_sim.faults.context import ActiveFault, CommandCheck, FaultTarget, G
 from mavlink_sim.faults.effects import chosen_links, shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
-from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.estimate_errors import as_reported
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.wire.link_faults import LinkStage
 from mavlink_sim.wire.links import Link
 

@@ -12,7 +12,8 @@ import math
 from dataclasses import dataclass
 
 from mavlink_sim.flight.position_control import Demand, PositionController
-from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor, Vector
+from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import (
     IDENTITY,

@@ -13,7 +13,8 @@ from enum import IntEnum
 
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Trajectory, TrajectoryTask
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 MIN_RADIUS_M = 1.0

@@ -8,7 +8,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Vector
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 NAN = math.nan

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import TrajectorySetpoint
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 SETTLE_S = 2.0  # above the start point or the target, before going on

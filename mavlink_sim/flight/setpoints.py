@@ -11,8 +11,8 @@ from typing import Any
 
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
-from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
+from mavlink_sim.physics.rotations import Vector
 
 LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 BODY_NED = 8  # MAV_FRAME_BODY_NED

@@ -10,7 +10,8 @@ from abc import ABC, abstractmethod
 
 from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, Demand, TrajectorySetpoint
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 # MPC_YAW_MODE

@@ -12,8 +12,8 @@ from enum import IntEnum
 
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
-from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 
 Point = tuple[float, float]  # north, east, metres

@@ -15,8 +15,9 @@ from mavlink_sim.flight.precision_landing import Precision, PrecisionLanding
 from mavlink_sim.missions import items as mission_items
 from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.plan import Mission
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import INFO
 

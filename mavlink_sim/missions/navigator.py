@@ -29,8 +29,9 @@ from mavlink_sim.missions.return_flight import (
     landing_route,
     mission_route,
 )
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text

@@ -2,12 +2,8 @@
 
 World frame NED with its origin on the ground where the vehicle started, body frame FRD. Mass, inertia, drag
 and rotors are those of PX4's own SIH quadrotor (its SIH_* parameters). The attitude is an integrated
-quaternion, so there is no singular tilt. PX4's attitude and rate controllers, with its default gains, and its
-mixer with saturation run at every step, as on the real vehicle; the integral parts are replaced by their
-steady value on this balanced airframe. The attitude loop compares thrust axes (the "reduced attitude" of
-Brescianini, Hehn, D'Andrea, 2013), so it knows no gimbal lock. Plain floats in local names of one function:
-numpy scalars, or an object for a vector, would make the step, and every test in lockstep, several times
-slower; calls of a function for each loop and the mixer cost a tenth of a whole flight.
+quaternion, so there is no singular tilt. PX4's inner loops, `rotor_control`, run at every step, as on the
+real vehicle.
 """
 
 from __future__ import annotations
@@ -26,27 +22,15 @@ from mavlink_sim.physics.contact import (
     Collision,
 )
 from mavlink_sim.physics.gaussian import BITS, NORMAL
-
-ATTITUDE_GAIN_PER_S = 4.0  # MC_ROLL_P, MC_PITCH_P
-MAX_TILT_RATE_RADPS = math.radians(220.0)  # MC_ROLLRATE_MAX, MC_PITCHRATE_MAX
-MAX_YAW_RATE_RADPS = math.radians(200.0)  # MC_YAWRATE_MAX
-# Share of full thrust per rad/s: MC_ROLLRATE_P 0.15 through PX4's allocation of a roll to rotors (1/sqrt 2).
-RATE_P = 0.15 * math.sqrt(0.5)
-RATE_D = 0.003 * math.sqrt(0.5)
-# MC_YAWRATE_P 0.2 alone turns SIH's weak rotor torque into 0.4 s of lag, which PX4's integral part shortens;
-# this gain gives a lag of 0.15 s without one.
-YAW_RATE_P = 0.5
-# Share of full thrust per rad/s that angular drag (SIH_KDW) takes, of rotors on their arms and by torque.
-RATE_DRAG = 0.025 / (4 * 5.0 * 0.2)
-YAW_RATE_DRAG = 0.025 / (4 * 0.1)
-# Yaw is served last, but PX4 keeps this share of the range for it by lowering the thrust.
-YAW_MARGIN = 0.15
-
-
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Matrix = tuple[float, float, float, float, float, float, float, float, float]
-Rotors = tuple[float, float, float, float]
+from mavlink_sim.physics.rotations import (
+    Matrix,
+    Quaternion,
+    Vector,
+    integrated,
+    rotation_matrix,
+    turned_back,
+)
+from mavlink_sim.physics.rotor_control import MAX_YAW_RATE_RADPS, Rotors, attitude_loop, mix, rate_loop
 
 GRAVITY_MPS2 = 9.80665
 ROTOR_THRUST_MPS2 = 5.0  # SIH_T_MAX 5 N on SIH_MASS 1 kg
@@ -69,7 +53,9 @@ FRICTION = 0.8
 MAX_STANDING_TILT_COSINE = 0.5
 
 _LEVEL: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_DOWN: Vector = (0.0, 0.0, 1.0)
 _STILL: Vector = (0.0, 0.0, 0.0)
+_BROKEN: Rotors = (0.0, 0.0, 0.0, 0.0)
 
 
 class Multirotor:
@@ -96,14 +82,16 @@ class Multirotor:
     """
 
     __slots__ = (
+        "_angular_acceleration",
         "_contacts",
-        "_demand",
+        "_down_demand",
         "_gust",
         "_gust_left_s",
         "_matrix",
         "_random",
         "_rate_demand",
-        "_spin",
+        "_thrust_demand_mps2",
+        "_yaw_rate_demand_radps",
         "acceleration",
         "collisions",
         "crashed",
@@ -143,10 +131,11 @@ class Multirotor:
         self.wind = wind
         self.gusts_mps = gusts_mps
         self._matrix = _LEVEL
-        self._spin: Vector = _STILL  # angular acceleration, rad/s²
-        # collective m/s², demanded body thrust axis in the heading frame, yaw rate about the vertical
-        self._demand = (0.0, 0.0, 0.0, 1.0, 0.0)
-        self._rate_demand: Vector | None = None
+        self._angular_acceleration: Vector = _STILL  # about FRD, rad/s²
+        self._thrust_demand_mps2 = 0.0
+        self._down_demand: Vector = _DOWN  # see `attitude_loop`
+        self._yaw_rate_demand_radps = 0.0
+        self._rate_demand: Vector | None = None  # instead of these two
         self._gust: Vector = _STILL
         self._gust_left_s = 0.0
         self._random = random.Random(seed)
@@ -194,7 +183,7 @@ class Multirotor:
     @property
     def thrust_mps2(self) -> float:
         """Collective thrust per mass, along body up."""
-        return sum(self.rotor_thrusts)
+        return _lift(self.rotor_thrusts)
 
     @thrust_mps2.setter
     def thrust_mps2(self, thrust_mps2: float) -> None:
@@ -204,29 +193,26 @@ class Multirotor:
     @property
     def specific_force(self) -> Vector:
         """The reading of an ideal accelerometer, body FRD m/s²."""
-        ax, ay, az = self.acceleration
-        az -= GRAVITY_MPS2
-        a, b, c, d, e, f, g, h, i = self._matrix
-        return (a * ax + d * ay + g * az, b * ax + e * ay + h * az, c * ax + f * ay + i * az)
+        north, east, down = self.acceleration
+        return turned_back(self._matrix, (north, east, down - GRAVITY_MPS2))
 
     # ---- demands ----------------------------------------------------------------------------------------
 
     def command(self, thrust_mps2: float, roll_rad: float, pitch_rad: float, yaw_rate_radps: float) -> None:
         """Set the demand: collective thrust, tilt relative to the heading, yaw rate about the vertical."""
         cosine = math.cos(roll_rad)
-        yaw_rate = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
-        self._demand = (
-            thrust_mps2,
+        self._thrust_demand_mps2 = thrust_mps2
+        self._down_demand = (
             math.sin(pitch_rad) * cosine,
             -math.sin(roll_rad),
             math.cos(pitch_rad) * cosine,
-            yaw_rate,
         )
+        self._yaw_rate_demand_radps = min(max(yaw_rate_radps, -MAX_YAW_RATE_RADPS), MAX_YAW_RATE_RADPS)
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
         """Set the demand: collective thrust and body rates; NaN: keep the rate demanded before."""
-        self._demand = (thrust_mps2, 0.0, 0.0, 1.0, 0.0)
+        self._thrust_demand_mps2 = thrust_mps2
         before = self._rate_demand or self.rates
         p, q, r = (
             asked if math.isnan(rate) else rate for rate, asked in zip(rates_radps, before, strict=True)
@@ -263,191 +249,108 @@ class Multirotor:
     # ---- time -------------------------------------------------------------------------------------------
 
     def advance(self, dt_s: float, steps: int = 1) -> None:
-        """Advance by steps of `dt_s` (at most ~10 ms) towards what was commanded.
+        """Advance by steps of `dt_s` (at most ~10 ms) towards what was commanded."""
+        for _ in range(steps):
+            if not self.on_ground or self._lifts_off(dt_s):
+                self._fly(dt_s)
 
-        Clear of the ground the attributes change only after the last of several steps.
-        """
-        if steps > 1 and self.on_ground:
-            for _ in range(steps):
-                self.advance(dt_s)
-            return
-        thrust, tilt_x, tilt_y, tilt_z, yaw_rate = self._demand
-        if self.on_ground:
-            blend = min(1.0, dt_s / ROTOR_TIME_CONSTANT_S)
-            share = 0.0 if self.crashed else min(max(thrust, 0.0), MAX_THRUST_MPS2) / 4.0
-            command = share / ROTOR_THRUST_MPS2
-            self.rotor_commands = (command, command, command, command)
-            lift = 0.0
-            thrusts = []
-            for now, whole in zip(self.rotor_thrusts, self.rotor_effectiveness, strict=True):
-                now += (share * whole - now) * blend
-                thrusts.append(now)
-                lift += now
-            self.rotor_thrusts = (thrusts[0], thrusts[1], thrusts[2], thrusts[3])
-            if lift * self._matrix[8] <= GRAVITY_MPS2:
-                self._stand(dt_s, lift)
-                return
-            self.on_ground = False
-        a, b, c, d, e, f, g, h, i = self._matrix
+    def _lifts_off(self, dt_s: float) -> bool:
+        """On the ground: run the rotors; stand, unless they lift the vehicle."""
+        thrust_mps2 = 0.0 if self.crashed else min(max(self._thrust_demand_mps2, 0.0), MAX_THRUST_MPS2)
+        each_mps2 = thrust_mps2 / 4.0
+        command = each_mps2 / ROTOR_THRUST_MPS2
+        self.rotor_commands = (command, command, command, command)
+        self.rotor_thrusts = self._thrusts_after((each_mps2, each_mps2, each_mps2, each_mps2), dt_s)
+        lift_mps2 = _lift(self.rotor_thrusts)
+        if lift_mps2 * self._matrix[8] <= GRAVITY_MPS2:
+            self._stand(dt_s, lift_mps2)
+            return False
+        self.on_ground = False
+        return True
+
+    def _fly(self, dt_s: float) -> None:
+        """One step in the air: control, rotors, turn and motion."""
+        rates_demand = self._rate_demand or attitude_loop(
+            self._matrix, self._down_demand, self._yaw_rate_demand_radps
+        )
+        torques = rate_loop(rates_demand, self.rates, self._angular_acceleration)
+        commands = mix(self._thrust_demand_mps2 / MAX_THRUST_MPS2, torques)
+        front_right, rear_left, front_left, rear_right = commands
+        thrusts = self._thrusts_after(
+            (
+                ROTOR_THRUST_MPS2 * front_right,
+                ROTOR_THRUST_MPS2 * rear_left,
+                ROTOR_THRUST_MPS2 * front_left,
+                ROTOR_THRUST_MPS2 * rear_right,
+            ),
+            dt_s,
+        )
+        angular_acceleration = _angular_acceleration(thrusts, self.rates)
         p, q, r = self.rates
-        spin_x, spin_y, spin_z = self._spin
-        w, x, y, z = self.quaternion
-        north, east, down = self.position
-        vx, vy, vz = self.velocity
-        t0, t1, t2, t3 = self.rotor_thrusts
-        e0, e1, e2, e3 = (0.0, 0.0, 0.0, 0.0) if self.crashed else self.rotor_effectiveness
-        blend = dt_s / ROTOR_TIME_CONSTANT_S
-        if blend > 1.0:
-            blend = 1.0
-        half = 0.5 * dt_s
-        limit, coupling = MAX_TILT_RATE_RADPS, _COUPLING_KGM2
-        collective = thrust / MAX_THRUST_MPS2
-        collective = 0.0 if collective < 0.0 else 1.0 if collective > 1.0 else collective
-        rate_demand = self._rate_demand
-        gusty = self.gusts_mps > 0.0
-        air_x, air_y, air_z = self._air_velocity() if gusty else self.wind
-        remaining = 0  # steps after a contact
-        for left in range(steps - 1, -1, -1):
-            # the attitude loop: body rates (FRD) that turn the thrust axis to the demanded direction
-            if rate_demand is not None:
-                wanted_p, wanted_q, wanted_r = rate_demand
-            else:
-                heading = math.sqrt(a * a + d * d)
-                if heading > 1e-6:
-                    cosine, sine = a / heading, d / heading
-                else:  # the nose points straight up or down: the heading is that of the right axis
-                    wing = math.sqrt(b * b + e * e)
-                    cosine, sine = e / wing, -b / wing
-                tilt_north = cosine * tilt_x - sine * tilt_y
-                tilt_east = sine * tilt_x + cosine * tilt_y
-                # the demanded axis in the body frame
-                axis_x = a * tilt_north + d * tilt_east + g * tilt_z
-                axis_y = b * tilt_north + e * tilt_east + h * tilt_z
-                axis_z = c * tilt_north + f * tilt_east + i * tilt_z
-                # 2 sin(angle / 2) about the axis e_z × wanted, as PX4 takes it from the error quaternion
-                if axis_z > -0.98:
-                    gain = ATTITUDE_GAIN_PER_S * math.sqrt(2.0 / (1.0 + axis_z))
-                    wanted_p = -gain * axis_y
-                    wanted_q = gain * axis_x
-                else:  # upside down: every direction is as short; exactly upside down one must be selected
-                    wanted_p = limit if axis_y <= 0.0 else -limit
-                    wanted_q = 10.0 * ATTITUDE_GAIN_PER_S * axis_x
-                wanted_p = limit if wanted_p > limit else -limit if wanted_p < -limit else wanted_p
-                wanted_q = limit if wanted_q > limit else -limit if wanted_q < -limit else wanted_q
-                wanted_p += yaw_rate * g
-                wanted_q += yaw_rate * h
-                wanted_r = yaw_rate * i
+        roll_radps2, pitch_radps2, yaw_radps2 = angular_acceleration
+        rates = (p + roll_radps2 * dt_s, q + pitch_radps2 * dt_s, r + yaw_radps2 * dt_s)
 
-            # The rate loop and the mixer. At saturation, collective thrust is lowered first, then tilt is
-            # scaled down, and yaw gets the rest (PX4's sequential desaturation without air mode).
-            roll = RATE_P * (wanted_p - p) - RATE_D * spin_x + RATE_DRAG * wanted_p
-            pitch = RATE_P * (wanted_q - q) - RATE_D * spin_y + RATE_DRAG * wanted_q
-            yaw = YAW_RATE_P * (wanted_r - r) + YAW_RATE_DRAG * wanted_r
-            base = collective
-            spread = (roll if roll >= 0.0 else -roll) + (pitch if pitch >= 0.0 else -pitch)
-            if spread > 0.5:
-                scale = 0.5 / spread
-                roll *= scale
-                pitch *= scale
-                spread = 0.5
-            if base + spread > 1.0:
-                base = 1.0 - spread
-            if base < spread:
-                scale = base / spread
-                roll *= scale
-                pitch *= scale
-                spread = base
-            reserve = (yaw if yaw >= 0.0 else -yaw) if -YAW_MARGIN < yaw < YAW_MARGIN else YAW_MARGIN
-            if base + spread + reserve > 1.0:
-                base = max(1.0 - spread - reserve, spread)
-            margin = (1.0 - base if base > 0.5 else base) - spread
-            if margin < 0.0:
-                margin = 0.0
-            yaw = margin if yaw > margin else -margin if yaw < -margin else yaw
-            u0 = base - roll + pitch + yaw
-            u1 = base + roll - pitch + yaw
-            u2 = base + roll + pitch - yaw
-            u3 = base - roll - pitch - yaw
+        air = self._air_velocity(dt_s) if self.gusts_mps > 0.0 else self.wind
+        acceleration = _acceleration(thrusts, self._matrix, air, self.velocity)
+        north_mps2, east_mps2, down_mps2 = acceleration
+        north_mps, east_mps, down_mps = self.velocity
+        north_mps += north_mps2 * dt_s
+        east_mps += east_mps2 * dt_s
+        down_mps += down_mps2 * dt_s
+        north_m, east_m, down_m = self.position
+        north_m += north_mps * dt_s
+        east_m += east_mps * dt_s
+        down_m += down_mps * dt_s
+        if down_m >= 0.0 and down_mps >= 0.0:
+            down_m = 0.0
+            down_mps = self._touch(down_mps, self._matrix[8])
 
-            t0 += (ROTOR_THRUST_MPS2 * u0 * e0 - t0) * blend
-            t1 += (ROTOR_THRUST_MPS2 * u1 * e1 - t1) * blend
-            t2 += (ROTOR_THRUST_MPS2 * u2 * e2 - t2) * blend
-            t3 += (ROTOR_THRUST_MPS2 * u3 * e3 - t3) * blend
+        self.rotor_commands, self.rotor_thrusts = commands, thrusts
+        self._angular_acceleration, self.rates = angular_acceleration, rates
+        self.quaternion = integrated(self.quaternion, rates, dt_s)
+        self._matrix = rotation_matrix(self.quaternion)
+        self.acceleration, self.velocity = acceleration, (north_mps, east_mps, down_mps)
+        self.position = (north_m, east_m, down_m)
 
-            # torques of the rotors (1 kg, so m/s² are newtons), drag, and the gyroscopic coupling of the body
-            spin_x = (ARM_M * (t1 + t2 - t0 - t3) - ANGULAR_DRAG_NMS * p + coupling * q * r) / INERTIA_XY_KGM2
-            spin_y = (ARM_M * (t0 + t2 - t1 - t3) - ANGULAR_DRAG_NMS * q - coupling * p * r) / INERTIA_XY_KGM2
-            spin_z = (_TORQUE_PER_THRUST_M * (t0 + t1 - t2 - t3) - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2
-            p += spin_x * dt_s
-            q += spin_y * dt_s
-            r += spin_z * dt_s
-
-            if gusty:
-                self._gust_left_s -= dt_s
-                if self._gust_left_s <= 0.0:
-                    self._blow()
-                    air_x, air_y, air_z = self._air_velocity()
-            lift = t0 + t1 + t2 + t3
-            ax = LINEAR_DRAG_PER_S * (air_x - vx) - lift * c
-            ay = LINEAR_DRAG_PER_S * (air_y - vy) - lift * f
-            az = LINEAR_DRAG_PER_S * (air_z - vz) - lift * i + GRAVITY_MPS2
-            vx += ax * dt_s
-            vy += ay * dt_s
-            vz += az * dt_s
-            north += vx * dt_s
-            east += vy * dt_s
-            down += vz * dt_s
-            if down >= 0.0 and vz >= 0.0:
-                down = 0.0
-                vz = self._touch(vz, i)
-                remaining = left
-
-            half_p, half_q, half_r = p * half, q * half, r * half
-            new_w = w - x * half_p - y * half_q - z * half_r
-            new_x = x + w * half_p + y * half_r - z * half_q
-            new_y = y + w * half_q + z * half_p - x * half_r
-            new_z = z + w * half_r + x * half_q - y * half_p
-            scale = 1.0 / math.sqrt(new_w * new_w + new_x * new_x + new_y * new_y + new_z * new_z)
-            w = new_w * scale
-            x = new_x * scale
-            y = new_y * scale
-            z = new_z * scale
-            xx, yy, zz = x * x, y * y, z * z
-            xy, xz, yz = x * y, x * z, y * z
-            wx, wy, wz = w * x, w * y, w * z
-            a, b, c = 1.0 - 2.0 * (yy + zz), 2.0 * (xy - wz), 2.0 * (xz + wy)
-            d, e, f = 2.0 * (xy + wz), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - wx)
-            g, h, i = 2.0 * (xz - wy), 2.0 * (yz + wx), 1.0 - 2.0 * (xx + yy)
-            if remaining:
-                break
-        self.rotor_commands, self.rotor_thrusts = (u0, u1, u2, u3), (t0, t1, t2, t3)
-        self._spin, self.rates = (spin_x, spin_y, spin_z), (p, q, r)
-        self.quaternion, self._matrix = (w, x, y, z), (a, b, c, d, e, f, g, h, i)
-        self.position, self.velocity, self.acceleration = (north, east, down), (vx, vy, vz), (ax, ay, az)
-        for _ in range(remaining):  # it stands now, bounces, or has no rotors
-            self.advance(dt_s)
+    def _thrusts_after(self, demanded: Rotors, dt_s: float) -> Rotors:
+        """The rotors' thrusts, m/s², a step after these were demanded of them: a first-order lag."""
+        front_right, rear_left, front_left, rear_right = self.rotor_thrusts
+        whole = _BROKEN if self.crashed else self.rotor_effectiveness
+        share = dt_s / ROTOR_TIME_CONSTANT_S
+        if share > 1.0:
+            share = 1.0
+        return (
+            front_right + (demanded[0] * whole[0] - front_right) * share,
+            rear_left + (demanded[1] * whole[1] - rear_left) * share,
+            front_left + (demanded[2] * whole[2] - front_left) * share,
+            rear_right + (demanded[3] * whole[3] - rear_right) * share,
+        )
 
     def blow(self, gust: Vector) -> None:
         """Set the gust, NED m/s, instead of an own one; to be repeated every 32 ms."""
         self._gust = gust
         self._gust_left_s = 1.0
 
-    def _air_velocity(self) -> Vector:
-        """Wind and gust."""
-        (wx, wy, wz), (gx, gy, gz) = self.wind, self._gust
-        return (wx + gx, wy + gy, wz + gz)
+    def _air_velocity(self, dt_s: float) -> Vector:
+        """Wind and gust of this step; the gust changes when it is due."""
+        self._gust_left_s -= dt_s
+        if self._gust_left_s <= 0.0:
+            self._change_gust()
+        north, east, down = self.wind
+        gust_north, gust_east, gust_down = self._gust
+        return (north + gust_north, east + gust_east, down + gust_down)
 
-    def _blow(self) -> None:
+    def _change_gust(self) -> None:
         """The next gust (a first-order Gauss-Markov process)."""
         self._gust_left_s += GUST_STEP_S
         keep = 1.0 - GUST_STEP_S / GUST_TIME_CONSTANT_S
         spread = self.gusts_mps * math.sqrt(1.0 - keep * keep)
         bits = self._random.getrandbits
-        gx, gy, gz = self._gust
+        north, east, down = self._gust
         self._gust = (
-            keep * gx + spread * NORMAL[bits(BITS)],
-            keep * gy + spread * NORMAL[bits(BITS)],
-            keep * gz + spread * NORMAL[bits(BITS)],
+            keep * north + spread * NORMAL[bits(BITS)],
+            keep * east + spread * NORMAL[bits(BITS)],
+            keep * down + spread * NORMAL[bits(BITS)],
         )
 
     # ---- the ground -------------------------------------------------------------------------------------
@@ -466,7 +369,7 @@ class Multirotor:
 
     def _stand(self, dt_s: float, lift: float) -> None:
         """On the ground: friction stops it, the landing gear levels it and keeps its heading."""
-        self.rates = self._spin = _STILL
+        self.rates = self._angular_acceleration = _STILL
         vx, vy, _ = self.velocity
         if vx != 0.0 or vy != 0.0:
             speed = math.hypot(vx, vy)
@@ -495,17 +398,37 @@ class Multirotor:
                 self.on_collision(collision)
 
 
-def rotation_matrix(quaternion: Quaternion) -> Matrix:
-    """The rotation, row by row, of a (w, x, y, z) quaternion of length 1."""
-    w, x, y, z = quaternion
+def _lift(thrusts: Rotors) -> float:
+    """The collective thrust, m/s², added in one order on all versions of Python (`sum` is not)."""
+    front_right, rear_left, front_left, rear_right = thrusts
+    return front_right + rear_left + front_left + rear_right
+
+
+def _angular_acceleration(thrusts: Rotors, rates: Vector) -> Vector:
+    """About FRD, rad/s²: torques of the rotors, drag, and the gyroscopic coupling of the body.
+
+    The vehicle has 1 kg, so thrusts in m/s² are newtons.
+    """
+    front_right, rear_left, front_left, rear_right = thrusts
+    p, q, r = rates
+    roll_nm = ARM_M * (rear_left + front_left - front_right - rear_right)
+    pitch_nm = ARM_M * (front_right + front_left - rear_left - rear_right)
+    yaw_nm = _TORQUE_PER_THRUST_M * (front_right + rear_left - front_left - rear_right)
     return (
-        1.0 - 2.0 * (y * y + z * z),
-        2.0 * (x * y - w * z),
-        2.0 * (x * z + w * y),
-        2.0 * (x * y + w * z),
-        1.0 - 2.0 * (x * x + z * z),
-        2.0 * (y * z - w * x),
-        2.0 * (x * z - w * y),
-        2.0 * (y * z + w * x),
-        1.0 - 2.0 * (x * x + y * y),
+        (roll_nm - ANGULAR_DRAG_NMS * p + _COUPLING_KGM2 * q * r) / INERTIA_XY_KGM2,
+        (pitch_nm - ANGULAR_DRAG_NMS * q - _COUPLING_KGM2 * p * r) / INERTIA_XY_KGM2,
+        (yaw_nm - ANGULAR_DRAG_NMS * r) / INERTIA_Z_KGM2,
+    )
+
+
+def _acceleration(thrusts: Rotors, ned_from_body: Matrix, air: Vector, velocity: Vector) -> Vector:
+    """NED, m/s²: drag, thrust and gravity. `air`: the velocity of the air, NED m/s, as `velocity`."""
+    lift_mps2 = _lift(thrusts)
+    _, _, down_n, _, _, down_e, _, _, down_d = ned_from_body  # the body's down axis
+    air_north, air_east, air_down = air
+    north, east, down = velocity
+    return (
+        LINEAR_DRAG_PER_S * (air_north - north) - lift_mps2 * down_n,
+        LINEAR_DRAG_PER_S * (air_east - east) - lift_mps2 * down_e,
+        LINEAR_DRAG_PER_S * (air_down - down) - lift_mps2 * down_d + GRAVITY_MPS2,
     )

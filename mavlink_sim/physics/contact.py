@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-Vector = tuple[float, float, float]
-Matrix = tuple[float, float, float, float, float, float, float, float, float]
+from mavlink_sim.physics.rotations import Matrix, Vector, turned, turned_back
 
 INERTIA_XY_KGM2 = 0.025  # SIH_IXX, SIH_IYY
 INERTIA_Z_KGM2 = 0.030  # SIH_IZZ
@@ -95,9 +94,9 @@ def after_contact(
         The closing speed, m/s, and velocity and rates afterwards; if the speed is negative they already
         separate, and both are unchanged.
     """
-    out = _turned_back(ned_from_body, normal)
-    arm = _turned_back(ned_from_body, _touching_point(normal))
-    motion = Motion(_turned_back(ned_from_body, velocity), rates)
+    out = turned_back(ned_from_body, normal)
+    arm = turned_back(ned_from_body, _touching_point(normal))
+    motion = Motion(turned_back(ned_from_body, velocity), rates)
     into = -_dot(motion.at(arm), out)
     if into < 0.0:
         return into, velocity, rates
@@ -109,7 +108,7 @@ def after_contact(
         x, y, z = along
         against = (-x / sliding, -y / sliding, -z / sliding)
         motion.push(arm, against, sliding, SLIDING_FRICTION * pressed)
-    return into, _turned(ned_from_body, motion.velocity), motion.rates
+    return into, turned(ned_from_body, motion.velocity), motion.rates
 
 
 def back_speed(into_mps: float) -> float:
@@ -123,19 +122,6 @@ def _touching_point(normal: Vector) -> Vector:
     flat, high = RADIUS_M * RADIUS_M, HALF_HEIGHT_M * HALF_HEIGHT_M
     reach = math.sqrt(flat * (x * x + y * y) + high * z * z)
     return (-flat * x / reach, -flat * y / reach, -high * z / reach)
-
-
-def _turned(matrix: Matrix, vector: Vector) -> Vector:
-    """The vector rotated by a matrix (row by row)."""
-    x, y, z = vector
-    a, b, c, d, e, f, g, h, i = matrix
-    return (a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z)
-
-
-def _turned_back(matrix: Matrix, vector: Vector) -> Vector:
-    x, y, z = vector
-    a, b, c, d, e, f, g, h, i = matrix
-    return (a * x + d * y + g * z, b * x + e * y + h * z, c * x + f * y + i * z)
 
 
 def _dot(one: Vector, other: Vector) -> float:

@@ -22,8 +22,9 @@ import random
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
-from mavlink_sim.physics.airframe import Multirotor, Quaternion, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.gaussian import BITS, NORMAL
+from mavlink_sim.physics.rotations import Quaternion, Vector
 
 # Standard deviations, (north, east, down). Measured horizontally in three flights with manoeuvres, with 3, 0
 # and 5 m/s of wind: 0.28, 0.39 and 0.25 m/s (p50), 0.53, 0.74 and 0.50 (p95); here 0.31 and 0.65. Down it is

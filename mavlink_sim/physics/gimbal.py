@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.rotations import Vector, rotation_matrix, turned_back
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import Quaternion, quaternion_product
 
@@ -91,7 +91,7 @@ class Gimbal:
     def angular_velocity(self, body_rates: Vector) -> Vector:
         """About the gimbal's own axes, rad/s, given the vehicle's body rates (FRD)."""
         p, q, r = body_rates
-        x, y, z = _turned_back(self.body_quaternion, (p, q, r + self.pan_rate_radps))
+        x, y, z = turned_back(rotation_matrix(self.body_quaternion), (p, q, r + self.pan_rate_radps))
         return (x, y + self.tilt_rate_radps, z)
 
     def point(self, target: Target) -> None:
@@ -192,7 +192,7 @@ class Gimbal:
                 level * math.sin(self._aim_yaw_rad),
                 -math.sin(self._aim_pitch_rad),
             )
-            x, y, z = _turned_back(attitude, sight)
+            x, y, z = turned_back(rotation_matrix(attitude), sight)
             level = math.hypot(x, y)
             pan = math.atan2(y, x) if level > 1e-6 else self.pan_rad
             tilt = math.atan2(-z, level)
@@ -244,17 +244,6 @@ def _down_row(q: Quaternion) -> Vector:
 def _x_axis(q: Quaternion) -> Vector:
     w, x, y, z = q
     return (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y))
-
-
-def _turned_back(q: Quaternion, v: Vector) -> Vector:
-    """The vector in the frame that `q` turns from: its columns times `v`."""
-    w, x, y, z = q
-    a, b, c = v
-    return (
-        (1 - 2 * (y * y + z * z)) * a + 2 * (x * y + w * z) * b + 2 * (x * z - w * y) * c,
-        2 * (x * y - w * z) * a + (1 - 2 * (x * x + z * z)) * b + 2 * (y * z + w * x) * c,
-        2 * (x * z + w * y) * a + 2 * (y * z - w * x) * b + (1 - 2 * (x * x + y * y)) * c,
-    )
 
 
 def _about_z(angle: float) -> Quaternion:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.contact import (
     BOUNCE_MPS,
     CRASH_MPS,
@@ -22,6 +22,7 @@ from mavlink_sim.physics.contact import (
     Collision,
     back_speed,
 )
+from mavlink_sim.physics.rotations import Vector
 
 if TYPE_CHECKING:
     from mavlink_sim.world.obstacles import Segment

@@ -19,8 +19,8 @@ from vision.attitude import euler_from_quaternion
 if TYPE_CHECKING:
     from mavlink_sim.camera.process import CameraProcess
     from mavlink_sim.camera.scene import Scene
-    from mavlink_sim.physics.airframe import Vector
     from mavlink_sim.physics.contact import Collision
+    from mavlink_sim.physics.rotations import Vector
     from mavlink_sim.vehicles.vehicle import Vehicle
 
 TRUTH_RATE_HZ = 20.0

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.orbit import OrbitRequest
-from mavlink_sim.physics.airframe import Vector
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED, Mode, mode_of
 from mavlink_sim.services import gimbal_protocol, parameter_protocol
 from mavlink_sim.services.context import ServiceContext

@@ -8,7 +8,7 @@ from pathlib import Path
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import load_scene
 from mavlink_sim.flight.collision_prevention import FRAME_BODY_FRD, ObstacleMap
-from mavlink_sim.physics.airframe import MAX_STANDING_TILT_COSINE, Multirotor, Vector
+from mavlink_sim.physics.airframe import MAX_STANDING_TILT_COSINE, Multirotor
 from mavlink_sim.physics.contact import (
     BOUNCE_MPS,
     CRASH_MPS,
@@ -20,6 +20,7 @@ from mavlink_sim.physics.contact import (
 )
 from mavlink_sim.physics.midair import Neighbours
 from mavlink_sim.physics.obstacle_sensor import MAXIMUM_CM, MAXIMUM_M, MINIMUM_CM, SECTOR_DEG, ObstacleSensor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.world.obstacles import Gap, Obstacle, Obstacles
 from mavlink_sim.world.world import World
 

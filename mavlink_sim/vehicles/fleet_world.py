@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.midair import Body, Midair, Neighbours
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.vehicles.vehicle import STEP_S, Vehicle
 from mavlink_sim.world.aircraft import Aircraft, aircraft_objects
 

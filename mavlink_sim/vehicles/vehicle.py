@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.faults.schedule import Faults
 from mavlink_sim.flight.transmitter import Transmitter
-from mavlink_sim.physics.airframe import GUST_STEP_S, GUST_TIME_CONSTANT_S, Multirotor, Vector
+from mavlink_sim.physics.airframe import GUST_STEP_S, GUST_TIME_CONSTANT_S, Multirotor
 from mavlink_sim.physics.contact import HARD_LANDING_MPS, Collision
 from mavlink_sim.physics.estimate_errors import FallibleEstimate
 from mavlink_sim.physics.gaussian import BITS, NORMAL
 from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Gimbal
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.physics.vision_aiding import VisionAiding
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mavlink_sim.camera.scene import Path, Scene
 from mavlink_sim.cli.main import main
 from mavlink_sim.lockstep import LockstepVehicle
-from mavlink_sim.physics.airframe import Multirotor, rotation_matrix
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.contact import (
     CRASH_MPS,
     HALF_HEIGHT_M,
@@ -23,6 +23,7 @@ from mavlink_sim.physics.contact import (
     Collision,
     after_contact,
 )
+from mavlink_sim.physics.rotations import rotation_matrix
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.realtime.simulation import Simulation
 from mavlink_sim.testing import free_udp_ports

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim import FleetWorld, LockstepVehicle
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor, Vector
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, Multirotor
 from mavlink_sim.physics.contact import CRASH_MPS, Collision
 from mavlink_sim.physics.midair import REACH_UP_M, Body, Midair, apart
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.realtime.fleet import Fleet, instance_options
 from mavlink_sim.realtime.options import SimulationOptions
 from mavlink_sim.testing import free_port, free_udp_port_range

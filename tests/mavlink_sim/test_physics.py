@@ -15,13 +15,9 @@ from numpy.typing import NDArray
 
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.flight.position_control import PositionController, TrajectorySetpoint
-from mavlink_sim.physics.airframe import (
-    GRAVITY_MPS2,
-    MAX_THRUST_MPS2,
-    Multirotor,
-    rotation_matrix,
-)
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.physics.estimate_errors import DRIFT_STEP_S, POSITION_TIME_CONSTANT_S, Estimate
+from mavlink_sim.physics.rotations import rotation_matrix
 from mavlink_sim.px4.parameters import Parameters
 
 STEP_S = 0.004
@@ -274,51 +270,6 @@ def test_small_demands_are_not_changed() -> None:
     assert nose_up[0] == nose_up[2] > nose_up[1] == nose_up[3]
     clockwise = rotor_commands(0.5, 0.0, 0.0, 0.1)
     assert clockwise[0] == clockwise[1] > clockwise[2] == clockwise[3]
-
-
-def test_several_steps_at_once_equal_single_steps() -> None:
-    one, other = hovering(seed=3, gusts_mps=0.8)[0], hovering(seed=3, gusts_mps=0.8)[0]
-    for index in range(400):
-        for airframe in (one, other):
-            airframe.command(GRAVITY_MPS2 + 0.01 * index, 0.3, -0.2, 1.5)
-        one.advance(STEP_S, 3)
-        for _ in range(3):
-            other.advance(STEP_S)
-        assert one.position == other.position
-        assert one.velocity == other.velocity
-        assert one.acceleration == other.acceleration
-        assert one.matrix == other.matrix
-        assert one.rates == other.rates
-        assert one.rotor_commands == other.rotor_commands
-
-
-@pytest.mark.parametrize("down_mps", [0.5, 2.5, 7.0])
-def test_several_steps_equal_single_steps_at_a_contact(down_mps: float) -> None:
-    """It lands, bounces, or crashes; then it stands, and what has not crashed takes off."""
-    one, other = Multirotor(seed=3, gusts_mps=0.8), Multirotor(seed=3, gusts_mps=0.8)
-    touches: tuple[list[float], list[float]] = ([], [])
-    for airframe, speeds in zip((one, other), touches, strict=True):
-        airframe.on_ground, airframe.position = False, (0.0, 0.0, -0.01)
-        airframe.velocity = (1.0, 0.0, down_mps)
-        airframe.on_touch = speeds.append
-    stood = False
-    for index in range(300):
-        for airframe in (one, other):
-            airframe.command(0.0 if index < 200 else 1.5 * GRAVITY_MPS2, 0.1, -0.1, 0.5)
-        one.advance(STEP_S, 7)
-        for _ in range(7):
-            other.advance(STEP_S)
-        assert (one.position, one.velocity, one.acceleration) == (
-            other.position,
-            other.velocity,
-            other.acceleration,
-        )
-        assert (one.matrix, one.rates, one.rotor_thrusts) == (other.matrix, other.rates, other.rotor_thrusts)
-        assert (one.on_ground, one.crashed) == (other.on_ground, other.crashed)
-        stood = stood or one.on_ground
-    assert touches[0] == touches[1] != []
-    assert stood
-    assert one.on_ground is one.crashed
 
 
 def test_full_thrust_climbs_and_drag_bounds_the_speed() -> None:

@@ -11,10 +11,11 @@ from hypothesis import strategies as st
 
 from mavlink_sim import FleetWorld, LockstepVehicle
 from mavlink_sim.flight.transmitter import Sticks
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.contact import HALF_HEIGHT_M, RADIUS_M
 from mavlink_sim.physics.midair import Body, Neighbours
 from mavlink_sim.physics.obstacle_sensor import MAXIMUM_M, NOTHING_CM
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.world.world import World
 from tests.mavlink_sim.conftest import CALIBRATION

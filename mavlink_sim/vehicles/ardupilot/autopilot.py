@@ -17,8 +17,9 @@ from mavlink_sim.autopilot.position_failsafe import Descend
 from mavlink_sim.flight import manual_flight
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import TrajectorySetpoint
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.geography import LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import (
     CUSTOM_MODE_ENABLED,
     GUIDED_ENABLED,

@@ -12,8 +12,8 @@ from typing import Any
 
 from mavlink_sim.autopilot.commander import ACCEPTED, TEMPORARILY_REJECTED
 from mavlink_sim.flight.setpoints import GLOBAL_RELATIVE_ALT_INT, GLOBAL_TERRAIN_ALT_INT
-from mavlink_sim.physics.airframe import Vector
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import CUSTOM_MODE_ENABLED
 from mavlink_sim.services.commands import (
     ARM_DISARM,

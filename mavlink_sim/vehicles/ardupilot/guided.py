@@ -28,8 +28,9 @@ from mavlink_sim.flight.setpoints import (
     YAW_IGNORE,
     YAW_RATE_IGNORE,
 )
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2, Multirotor, Vector
+from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import Quaternion, quaternion_from_euler
 

@@ -15,7 +15,8 @@ from typing import Any
 from mavlink_sim.flight import tasks as flight
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.precision_landing import LandingTarget
-from mavlink_sim.physics.airframe import Multirotor, Vector
+from mavlink_sim.physics.airframe import Multirotor
+from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import Quaternion, quaternion_inverse, quaternion_product
 
