@@ -156,26 +156,22 @@ class Estimate(Multirotor):
         self.acceleration = truth.acceleration
         self.rotor_thrusts = truth.rotor_thrusts
         self.crashed = truth.crashed
+        north_m, east_m, down_m = truth.position
+        north_mps, east_mps, down_mps = truth.velocity
         if self._noise:
             p, q, r = truth.rates
-            dx, dy, dz = self.rate_error
-            self.rates = (p + dx, q + dy, r + dz)
-            dx, dy, dz = self.drift
-            x, y, z = truth.position
-            ox, oy, oz = self.offset
-            self.position = (x + dx + ox, y + dy + oy, z + dz + oz)
-            ex, ey, ez = self.velocity_error
-            vx, vy, vz = truth.velocity
-            ox, oy, oz = self.velocity_offset
-            self.velocity = (vx + ex + ox, vy + ey + oy, vz + ez + oz)
+            noise_p, noise_q, noise_r = self.rate_error
+            self.rates = (p + noise_p, q + noise_q, r + noise_r)
+            north, east, down = self.drift
+            north_m, east_m, down_m = north_m + north, east_m + east, down_m + down
+            north, east, down = self.velocity_error
+            north_mps, east_mps, down_mps = north_mps + north, east_mps + east, down_mps + down
         else:
-            x, y, z = truth.position
-            ox, oy, oz = self.offset
-            self.position = (x + ox, y + oy, z + oz)
-            x, y, z = truth.velocity
-            ox, oy, oz = self.velocity_offset
-            self.velocity = (x + ox, y + oy, z + oz)
             self.rates = truth.rates
+        north, east, down = self.offset
+        self.position = (north_m + north, east_m + east, down_m + down)
+        north, east, down = self.velocity_offset
+        self.velocity = (north_mps + north, east_mps + east, down_mps + down)
 
     def _shake(self) -> None:
         """Draw white noise of the rates; at every third call advance the errors of velocity and position."""
@@ -188,50 +184,77 @@ class Estimate(Multirotor):
             self._drift(share)
 
     def _drift(self, share: float) -> None:
-        """The errors are a chain of low passes, so that none but the acceleration's has steps."""
-        dt = DRIFT_STEP_S
-        self._drift_left_s += dt
-        bits = self._noise_source.getrandbits
-        ax, ay, az = self._acceleration_error
-        nx, ny, nz = VELOCITY_ERROR_MPS
-        spread = share * self._noise * _VELOCITY_SPREAD
-        ax = _VELOCITY_KEEP * ax + spread * nx * NORMAL[bits(BITS)]
-        ay = _VELOCITY_KEEP * ay + spread * ny * NORMAL[bits(BITS)]
-        az = _VELOCITY_KEEP * az + spread * nz * NORMAL[bits(BITS)]
-        self._acceleration_error = (ax, ay, az)
-        ex, ey, ez = self.velocity_error
-        ex = _VELOCITY_KEEP * ex + ax * dt
-        ey = _VELOCITY_KEEP * ey + ay * dt
-        ez = _VELOCITY_KEEP * ez + az * dt
-        self.velocity_error = (ex, ey, ez)
-        dx, dy, dz = self.drift
-        tx, ty, tz = POSITION_TIME_CONSTANT_S
-        self.drift = (dx + (ex - dx / tx) * dt, dy + (ey - dy / ty) * dt, dz + (ez - dz / tz) * dt)
-        gauss = self._noise_source.gauss
-        self._slow_left_s -= dt
+        """Advance all errors but the white noise.
+
+        Those of velocity and position are a chain of low passes, so that none but the acceleration's has
+        steps. `share`: of their excitation.
+        """
+        step_s = DRIFT_STEP_S
+        self._drift_left_s += step_s
+        self._acceleration_error = self._next_acceleration_error(share)
+        north_mps2, east_mps2, down_mps2 = self._acceleration_error
+        north_mps, east_mps, down_mps = self.velocity_error
+        north_mps = _VELOCITY_KEEP * north_mps + north_mps2 * step_s
+        east_mps = _VELOCITY_KEEP * east_mps + east_mps2 * step_s
+        down_mps = _VELOCITY_KEEP * down_mps + down_mps2 * step_s
+        self.velocity_error = (north_mps, east_mps, down_mps)
+        north_m, east_m, down_m = self.drift
+        north_s, east_s, down_s = POSITION_TIME_CONSTANT_S
+        self.drift = (
+            north_m + (north_mps - north_m / north_s) * step_s,
+            east_m + (east_mps - east_m / east_s) * step_s,
+            down_m + (down_mps - down_m / down_s) * step_s,
+        )
+        self._slow_left_s -= step_s
         if self._slow_left_s <= 1e-9:
             self._slow_left_s += SLOW_STEP_S
-            keep = 1.0 - SLOW_STEP_S / ATTITUDE_TIME_CONSTANT_S
-            spread = self._noise * math.sqrt(1.0 - keep * keep)
-            tilt, turn = spread * TILT_ERROR_RAD, spread * YAW_ERROR_RAD
-            a, b, c = self.attitude_error
-            self.attitude_error = (
-                keep * a + gauss(0.0, tilt),
-                keep * b + gauss(0.0, tilt),
-                keep * c + gauss(0.0, turn),
-            )
-            keep = 1.0 - SLOW_STEP_S / BAROMETER_TIME_CONSTANT_S
-            spread = self._noise * math.sqrt(1.0 - keep * keep)
-            self.baro_error_m = keep * self.baro_error_m + gauss(0.0, spread * BAROMETER_DRIFT_M)
-            noise = self._noise * ACCELEROMETER_NOISE_MPS2
-            self.accelerometer_noise = (gauss(0.0, noise), gauss(0.0, noise), gauss(0.0, noise))
-        self._gps_left_s -= dt
+            self._drift_slowly()
+        self._gps_left_s -= step_s
         if self._gps_left_s <= 1e-9:
             self._gps_left_s += GPS_STEP_S
-            north, east, down = _scaled(GPS_NOISE_M, self._noise)
-            dx, dy, dz = self.drift
-            self.gps_error = (dx + gauss(0.0, north), dy + gauss(0.0, east), dz + gauss(0.0, down))
-            self.gps_velocity_error = gauss(0.0, self._noise * GPS_VELOCITY_NOISE_MPS)
+            self._take_fix()
+
+    def _next_acceleration_error(self, share: float) -> Vector:
+        """NED, m/s²."""
+        bits = self._noise_source.getrandbits
+        north, east, down = self._acceleration_error
+        spread = share * self._noise * _VELOCITY_SPREAD
+        spread_north, spread_east, spread_down = VELOCITY_ERROR_MPS
+        return (
+            _VELOCITY_KEEP * north + spread * spread_north * NORMAL[bits(BITS)],
+            _VELOCITY_KEEP * east + spread * spread_east * NORMAL[bits(BITS)],
+            _VELOCITY_KEEP * down + spread * spread_down * NORMAL[bits(BITS)],
+        )
+
+    def _drift_slowly(self) -> None:
+        """Advance the errors of attitude, barometer and accelerometer."""
+        gauss = self._noise_source.gauss
+        keep = 1.0 - SLOW_STEP_S / ATTITUDE_TIME_CONSTANT_S
+        spread = self._noise * math.sqrt(1.0 - keep * keep)
+        tilt_rad, turn_rad = spread * TILT_ERROR_RAD, spread * YAW_ERROR_RAD
+        roll, pitch, yaw = self.attitude_error
+        self.attitude_error = (
+            keep * roll + gauss(0.0, tilt_rad),
+            keep * pitch + gauss(0.0, tilt_rad),
+            keep * yaw + gauss(0.0, turn_rad),
+        )
+        keep = 1.0 - SLOW_STEP_S / BAROMETER_TIME_CONSTANT_S
+        spread = self._noise * math.sqrt(1.0 - keep * keep)
+        self.baro_error_m = keep * self.baro_error_m + gauss(0.0, spread * BAROMETER_DRIFT_M)
+        noise = self._noise * ACCELEROMETER_NOISE_MPS2
+        self.accelerometer_noise = (gauss(0.0, noise), gauss(0.0, noise), gauss(0.0, noise))
+
+    def _take_fix(self) -> None:
+        """A new fix of the GPS receiver."""
+        gauss = self._noise_source.gauss
+        noise_north, noise_east, noise_down = _scaled(GPS_NOISE_M, self._noise)
+        north, east, down = self.drift
+        self.gps_error = (
+            north + gauss(0.0, noise_north),
+            east + gauss(0.0, noise_east),
+            down + gauss(0.0, noise_down),
+        )
+        self.gps_velocity_error = gauss(0.0, self._noise * GPS_VELOCITY_NOISE_MPS)
 
     # ---- readings ---------------------------------------------------------------------------------------
 
