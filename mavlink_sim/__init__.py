@@ -31,13 +31,11 @@ if TYPE_CHECKING:
     from mavlink_sim.camera.simulated_camera import SimulatedCamera, frame_truth
     from mavlink_sim.lockstep import CommandRefusedError, LockstepVehicle, NotReachedError, Truth
     from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, running_simulator
-    from mavlink_sim.vehicles.fleet_world import FleetWorld
     from mavlink_sim.vehicles.vehicle import Vehicle
 
 __all__ = [
     "QUICK_FLIGHT",
     "CommandRefusedError",
-    "FleetWorld",
     "LockstepVehicle",
     "NotReachedError",
     "RunningSimulator",
@@ -53,7 +51,6 @@ __all__ = [
 
 _HOMES = {
     "CommandRefusedError": "lockstep",
-    "FleetWorld": "vehicles.fleet_world",
     "LockstepVehicle": "lockstep",
     "NotReachedError": "lockstep",
     "QUICK_FLIGHT": "testing",

@@ -139,7 +139,7 @@ class Truth:
         rates_radps: body FRD.
         mode: PX4's name of the flight mode. on_ground: touching it, or on top of an obstacle.
         landed: by the land detector.
-        collisions: count of those with the scene or another vehicle of its fleet world.
+        collisions: count of those with the scene.
         collision: the newest; None before the first.
 
     >>> from mavlink_sim import LockstepVehicle

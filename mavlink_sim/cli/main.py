@@ -21,7 +21,7 @@ import typer.core
 import typer.main
 
 from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
-from mavlink_sim.physics.midair import REACH_M
+from mavlink_sim.physics.contact import RADIUS_M
 from mavlink_sim.px4.parameters import UnknownParameterError
 from mavlink_sim.realtime.fleet import Fleet, instance_options
 from mavlink_sim.realtime.options import SimulationOptions
@@ -243,7 +243,7 @@ def simulate(
     _check("ready-after", ready_after, 0.0, 600.0)
     _check("speed", speed, 0.05, 20.0)
     if spacing is not None:
-        _check("spacing", spacing, REACH_M, 1000.0)  # closer than that they would overlap at the start
+        _check("spacing", spacing, 2.0 * RADIUS_M, 1000.0)  # closer than that they would overlap at the start
     try:
         noise_scale = float({"on": "1", "off": "0"}.get(noise, noise))
     except ValueError:

@@ -75,7 +75,7 @@ class Multirotor:
         crashed: it hit the ground too hard or upside down: the rotors are broken.
         on_touch: called with the downward speed, m/s, at every contact with the ground, before the motion and
             the rotors of that step are set.
-        collisions: count, with objects and vehicles. last_collision: the newest; None before the first.
+        collisions: count, with objects. last_collision: the newest; None before the first.
         on_collision: called with each.
         floor_down_m: NED z of the surface it stands or last stood on; 0 is the ground.
         wind: NED m/s steady wind; gusts of `gusts_mps` (standard deviation per axis) are added.

@@ -31,11 +31,11 @@ NEW_CONTACT_S = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Collision:
-    """One collision with an obstacle or another vehicle.
+    """One collision with an obstacle.
 
     Attributes:
         time_s: the scene's time at the first contact.
-        identifier, name: of the obstacle ("wall-2"), or the other's system id and "vehicle 2".
+        identifier, name: of the obstacle ("wall-2").
         speed_mps: closing speed along the surface normal.
         standing: on top of it: the airframe came to rest there, or bounced.
         crashed: it broke the rotors.
@@ -100,7 +100,8 @@ def after_contact(
     into = -_dot(motion.at(arm), out)
     if into < 0.0:
         return into, velocity, rates
-    pressed = motion.push(arm, out, into + back_speed(into))
+    rebound = RESTITUTION * into if into > BOUNCE_MPS else 0.0
+    pressed = motion.push(arm, out, into + rebound)
     point = motion.at(arm)
     along = _sum(point, out, -_dot(point, out))
     sliding = math.sqrt(_dot(along, along))
@@ -109,11 +110,6 @@ def after_contact(
         against = (-x / sliding, -y / sliding, -z / sliding)
         motion.push(arm, against, sliding, SLIDING_FRICTION * pressed)
     return into, turned(ned_from_body, motion.velocity), motion.rates
-
-
-def back_speed(into_mps: float) -> float:
-    """The rebound speed, m/s, after a contact at this speed."""
-    return RESTITUTION * into_mps if into_mps > BOUNCE_MPS else 0.0
 
 
 def _touching_point(normal: Vector) -> Vector:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 
 from mavlink_sim.physics.gaussian import BITS, NORMAL
-from mavlink_sim.world.obstacles import Obstacles, Segment
+from mavlink_sim.world.obstacles import Obstacles
 from mavlink_sim.world.world import Vector
 
 SECTOR_DEG = 5.0
@@ -27,16 +26,13 @@ class ObstacleSensor:
         self._obstacles = obstacles
         self._random = random.Random(f"obstacle sensor {seed}") if noise else None
 
-    def measure(
-        self, position_ned_m: Vector, yaw_rad: float, time_s: float, beside: Sequence[Segment] = ()
-    ) -> list[int]:
+    def measure(self, position_ned_m: Vector, yaw_rad: float, time_s: float) -> list[int]:
         """Centimetres, sector 0 around the nose, clockwise; NOTHING_CM where nothing is in range.
 
         Args:
             position_ned_m: of the sensor, in the world's frame. yaw_rad: of the nose, true.
-            beside: sections of other vehicles, (north, east) from the sensor.
         """
-        ranges = self._obstacles.ranges_around(position_ned_m, yaw_rad, MAXIMUM_M, time_s, beside)
+        ranges = self._obstacles.ranges_around(position_ned_m, yaw_rad, MAXIMUM_M, time_s)
         if self._random is not None:
             bits = self._random.getrandbits
             ranges = [value + NOISE_M * NORMAL[bits(BITS)] for value in ranges]

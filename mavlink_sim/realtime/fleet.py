@@ -86,7 +86,7 @@ def _numbered(path: Path | None, system_id: int) -> Path | None:
 
 
 class Fleet:
-    """Vehicles on one clock, in real time, which see each other and collide.
+    """Vehicles on one clock, in real time, which see each other.
 
     Use as a context manager; `run` returns after `stop`.
 
@@ -124,7 +124,7 @@ class Fleet:
 
     def run(self) -> None:
         """Run until `stop`."""
-        run_together(self.simulations, lambda: self._stopped, self._on_event, self._fleet_world.meet)
+        run_together(self.simulations, lambda: self._stopped, self._on_event)
 
 
 def _named(on_event: Callable[[str], None], system_id: int) -> Callable[[str], None]:

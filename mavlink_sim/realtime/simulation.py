@@ -19,7 +19,6 @@ from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import STEP_S
 from mavlink_sim.wire.endpoint import UdpEndpoint, recording
 from mavlink_sim.wire.streams import GCS_RATES_HZ
-from mavlink_sim.world.aircraft import identifier_offset
 
 PACE_PERIOD_S = 5.0
 
@@ -90,7 +89,7 @@ class Simulation:
                 fault_injector(self.vehicle.faults, options.system_id, self.endpoints, options, on_event)
             )
             fleet_world = FleetWorld(1) if fleet_world is None else fleet_world
-            fleet_world.join(self.vehicle, 0 if scene is None else identifier_offset(scene.world))
+            fleet_world.join(self.vehicle)
             self._outputs = SimOutputs(self.vehicle, scene, fleet_world, options, on_event, self._resources)
         except BaseException:
             self._resources.close()
@@ -215,12 +214,8 @@ def run_together(
     simulations: Sequence[Simulation],
     stopped: Callable[[], bool],
     on_event: Callable[[str], None],
-    stepped_all: Callable[[], None] = lambda: None,
 ) -> None:
-    """The loop: wait for the sockets until the next step is due, process messages, step, send.
-
-    `stepped_all` is called after each step of all of them.
-    """
+    """The loop: wait for the sockets until the next step is due, process messages, step, send."""
     first = simulations[0]
     speed = first.speed
     pace = _Pace(speed, on_event)
@@ -247,7 +242,6 @@ def run_together(
             for _ in range(steps):
                 for simulation in simulations:
                     simulation.step()
-                stepped_all()
             for simulation in simulations:
                 simulation.settle(stepped=steps > 0)
             if steps:

@@ -18,8 +18,7 @@ from mavlink_sim.physics.contact import (
     Collision,
     after_contact,
 )
-from mavlink_sim.physics.midair import Neighbours
-from mavlink_sim.physics.obstacle_sensor import MAXIMUM_CM, MAXIMUM_M, MINIMUM_CM, SECTOR_DEG, ObstacleSensor
+from mavlink_sim.physics.obstacle_sensor import MAXIMUM_CM, MINIMUM_CM, SECTOR_DEG, ObstacleSensor
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.world.obstacles import Gap, Obstacle, Obstacles
 from mavlink_sim.world.world import World
@@ -223,16 +222,12 @@ class CollisionWorld:
         found = self._obstacles.range_along(self.airframe.centre_ned_m, (x, y, z), self._clock())
         return max(found - HALF_HEIGHT_M, 0.0)
 
-    def sense_obstacles(
-        self, into: ObstacleMap, yaw_rad: float, now_s: float, neighbours: Neighbours | None = None
-    ) -> None:
+    def sense_obstacles(self, into: ObstacleMap, yaw_rad: float, now_s: float) -> None:
         """Add a measurement of the obstacle sensor to the map of collision prevention.
 
         Args:
             into: the vehicle's map. yaw_rad: its estimated heading. now_s: seconds since its boot.
-            neighbours: the other vehicles.
         """
         airframe = self.airframe
-        beside = [] if neighbours is None else neighbours.outlines(MAXIMUM_M)
-        ranges_cm = self._sensor.measure(airframe.centre_ned_m, airframe.yaw_rad, self._clock(), beside)
+        ranges_cm = self._sensor.measure(airframe.centre_ned_m, airframe.yaw_rad, self._clock())
         into.add(ranges_cm, SECTOR_DEG, 0.0, MINIMUM_CM, MAXIMUM_CM, FRAME_BODY_FRD, yaw_rad, now_s)

@@ -43,7 +43,6 @@ from mavlink_sim.wire.streams import EQUIPMENT_RATES_HZ, ONBOARD_RATES_HZ, PX4_C
 
 if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
-    from mavlink_sim.physics.midair import Neighbours
     from mavlink_sim.vehicles.collision_world import CollisionWorld
     from mavlink_sim.world.world import World
 
@@ -124,8 +123,7 @@ class Vehicle:
         SceneError: the scene cannot be used.
 
     Attributes:
-        airframe: the motion (truth). collision_world: the scene, None without one. neighbours: the other
-            vehicles of its fleet, None without a fleet.
+        airframe: the motion (truth). collision_world: the scene, None without one.
         estimate: the vehicle's estimate of it. faults: the active and scheduled faults.
         autopilot: Commander and Navigator. parameters: the parameter set. links: by name.
         clock_ns: the boot clock of TIMESYNC; by default the stepped time.
@@ -179,7 +177,6 @@ class Vehicle:
         if obstacle_sensor and scene is None:
             raise ValueError("obstacle_sensor=True needs a scene: there is nothing to measure without one")
         self.collision_world: CollisionWorld | None = None
-        self.neighbours: Neighbours | None = None
         self._obstacle_sensor = obstacle_sensor
         if scene is None:
             self.airframe = Multirotor(seed, gusts_mps=gusts_mps)
@@ -214,10 +211,6 @@ class Vehicle:
         self._wind_revision = -1
         self._boot()
         self.gimbal_manager = GimbalManager(self) if gimbal else None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """The state for a copy, which is in no fleet world."""
-        return {**vars(self), "neighbours": None}
 
     def _boot(self) -> None:
         """Initialize the state that does not survive a reboot."""
@@ -279,13 +272,8 @@ class Vehicle:
         return self.autopilot.supervision.transmitter
 
     def obstacle_below_m(self) -> float:
-        """From the legs along the body's down axis to the scene or another vehicle; inf: none."""
-        found = math.inf
-        if self.collision_world is not None:
-            found = self.collision_world.range_below_m()
-        if self.neighbours is not None:
-            found = min(found, self.neighbours.range_below_m())
-        return found
+        """From the legs along the body's down axis to the scene; inf: none."""
+        return math.inf if self.collision_world is None else self.collision_world.range_below_m()
 
     def second_autopilot(self, system_id: int, seed: int, east_m: float) -> Vehicle:
         """Another vehicle of the same firmware, ready at once, that starts `east_m` east of this one."""
@@ -451,7 +439,7 @@ class Vehicle:
             self._on_event(f"hard landing at {down_mps:.1f} m/s")
 
     def _on_collision(self, collision: Collision) -> None:
-        """Report a collision with the scene or another vehicle."""
+        """Report a collision with the scene."""
         self._on_event(str(collision))
 
     def _sense_obstacles(self) -> None:
@@ -460,7 +448,7 @@ class Vehicle:
         self.estimate.refresh()
         autopilot = self.autopilot
         self.collision_world.sense_obstacles(
-            autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s, self.neighbours
+            autopilot.navigator.obstacles, self.estimate.yaw_rad, autopilot.now_s
         )
         self.after(OBSTACLE_SENSOR_PERIOD_S, self._sense_obstacles)
 

@@ -6,7 +6,7 @@ Moving objects are at their position of the given time. Everything is NED metres
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -58,9 +58,6 @@ FLAT_M = 0.05
 _NEAR_M = 0.05
 _VELOCITY_STEP_S = 0.01
 _STILL: Vector = (0.0, 0.0, 0.0)
-
-Segment = tuple[tuple[float, float], tuple[float, float]]
-"""The ends of a level line, (north, east) metres."""
 
 
 class ObstacleMotion(Protocol):
@@ -290,18 +287,13 @@ class Obstacles:
         """Metres from a point along a unit vector to the first obstacle; inf: none."""
         return min((one.along(origin, direction) for one in self._placed(time_s)), default=math.inf)
 
-    def ranges_around(
-        self, origin: Vector, yaw_rad: float, range_m: float, time_s: float, beside: Sequence[Segment] = ()
-    ) -> list[float]:
+    def ranges_around(self, origin: Vector, yaw_rad: float, range_m: float, time_s: float) -> list[float]:
         """Metres to the nearest obstacle at a point's height, in each of `sectors.SECTORS`; inf: out of
         range.
 
-        The first sector is centred on `yaw_rad`, the others follow clockwise. `beside`: further segments at
-        that height, from the point.
+        The first sector is centred on `yaw_rad`, the others follow clockwise.
         """
         cuts = [one.outline(origin) for one in self._placed(time_s) if one.far_m(origin) <= range_m]
-        if beside:
-            cuts.append(np.array(beside))
         segments = np.concatenate(cuts) if cuts else np.zeros((0, 2, 2))
         if not len(segments):
             return [math.inf] * SECTORS
