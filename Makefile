@@ -1,5 +1,5 @@
 # Everything a person does here: `make demo`, `make test`, `make lint`. Each makes the virtual environment once.
-# `make browser` installs what the tests of the page need: without it they are left out.
+# `make programs` installs what tests need beyond Python packages: without it they are left out.
 PYTHON ?= python3
 VENV ?= .venv
 # Where torch is taken from, e.g. TORCH_INDEX=URL of an index of CPU wheels. Empty: pip's own configuration.
@@ -14,6 +14,8 @@ REALTIME_WORKERS ?= 6
 REALTIME = $(filter-out tests/alone/%,$(sort $(shell grep -rl mark.realtime tests --include='test_*.py' | xargs grep -L mark.sitl)))
 PAGE_TESTS := tests/companion/dashboard
 AXE := $(PAGE_TESTS)/node_modules/axe-core/axe.min.js
+# GPL, and used by tests alone: in an environment of its own.
+MAVPROXY := .venv-mavproxy/bin/mavproxy.py
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -21,7 +23,13 @@ define REFUSE_CUDA
 import json, sys; names = [i["metadata"]["name"] for i in json.load(sys.stdin)["install"]]; cuda = [n for n in names if n.lower().startswith(("nvidia", "cuda", "triton"))]; sys.exit("torch would bring %s: name an index of CPU wheels with TORCH_INDEX=..., or ask for it with ALLOW_CUDA=1" % ", ".join(cuda) if cuda else 0)
 endef
 
-.PHONY: demo test test-slow browser chromium lint format clean
+# Package indexes may be slow: the command is tried three times; then the last line names what could not be installed.
+define TRY
+@for try in 1 2 3; do if timeout 600 sh -ec '$(2)'; then exit 0; fi; sleep $$((5 * try)); done; \
+	echo "make programs: could not install $(1); the lines above say why" >&2; exit 1
+endef
+
+.PHONY: demo test test-slow programs debian lint format clean
 
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
@@ -32,7 +40,7 @@ test: $(READY)
 	$(BIN)/python -m pytest tests/alone -m "not slow" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
-	@$(BIN)/python -m tests.companion.dashboard.programs
+	@$(BIN)/python -m tests.programs
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow
@@ -40,15 +48,20 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
 
-browser: chromium $(AXE)
+programs: debian $(AXE) $(MAVPROXY)
 
-chromium:
-	which chromium || which chromium-browser || which google-chrome || { apt-get update -qq && \
-		DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends chromium; }
+debian: DEBIAN = $(shell $(PYTHON) -m tests.programs debian)
+debian:
+	$(if $(DEBIAN),$(call TRY,$(DEBIAN),apt-get update -qq; DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends $(DEBIAN)))
 
-$(AXE): $(PAGE_TESTS)/package-lock.json
-	cd $(PAGE_TESTS) && npm ci --ignore-scripts
-	touch $@
+$(AXE): $(PAGE_TESTS)/package-lock.json | debian
+	$(call TRY,axe-core,cd $(PAGE_TESTS); npm ci --ignore-scripts)
+	@touch $@
+
+$(MAVPROXY): constraints.txt
+	@test -x $(@D)/python || $(PYTHON) -m venv .venv-mavproxy
+	$(call TRY,MAVProxy,$(@D)/python -m pip install --quiet --constraint constraints.txt pymavlink pyserial==3.5; $(@D)/python -m pip install --quiet --no-deps MAVProxy==1.8.75)
+	@touch $@
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -70,4 +83,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) $(PAGE_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-mavproxy $(PAGE_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -9,6 +9,8 @@ import pytest
 import typer
 from hypothesis import settings
 
+from tests.programs import MAKE, NEEDS, REQUIRED
+
 # How long an example takes says more of the machine than of the code. The same examples every time, so that a
 # failure is of the change; `make test-slow` tries new ones, and more where a test sets no number.
 settings.register_profile("steady", deadline=None, derandomize=True, max_examples=40)
@@ -17,6 +19,16 @@ settings.load_profile("steady")
 
 # Tests run side by side: a thread pool of torch or OpenCV in each of them would only wait for the others'.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out a test that needs what is not here; fail it where all that can be installed is required."""
+    for name in (name for mark in item.iter_markers("needs") for name in mark.args):
+        need = NEEDS[name]
+        if not need.here:
+            refuse = pytest.fail if REQUIRED and need.get == MAKE else pytest.skip
+            refuse(f"no {name}: {need.get}")
 
 
 @pytest.fixture(scope="session", autouse=True)

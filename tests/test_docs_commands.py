@@ -60,7 +60,7 @@ NOT_RUN = {
     "sudo ": "a board with systemd",
     "cd /opt/companion": "a board with systemd",
     "make test": "this test",
-    "make browser": "a download",
+    "make programs": "a download",
     "make lint": "minutes, for all files",
     "make format": "changes the files",
     "ray ": "a Ray cluster",

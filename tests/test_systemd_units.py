@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -79,7 +78,7 @@ def test_what_the_service_writes_is_its_own() -> None:
     assert settings(UNIT)["UMask"] == ["0077"]
 
 
-@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+@pytest.mark.needs("systemd-analyze")
 @pytest.mark.parametrize("unit", [UNIT, TEMPLATE], ids=lambda path: path.name)
 def test_exposure_stays_small(unit: Path) -> None:
     command = ["systemd-analyze", "security", "--offline=true", f"--threshold={LARGEST_EXPOSURE}"]

@@ -24,7 +24,6 @@ from companion.bus.topics import COMMAND_STATE, DETECTIONS, EVENTS, IMAGE, ROOT,
 from companion.guidance.grammar import json_schema
 from mavlink_sim.testing import free_port
 from tests.companion.dashboard.chromium import Browser, Tab, chromium, wait_for
-from tests.companion.dashboard.programs import AXE, needs_axe, needs_chromium
 from tests.companion.dashboard.serving import dashboard_command, dashboard_here
 from tests.companion.dashboard.test_bridge import FOUND, NAME, Publisher, frame, publishing
 from tests.companion.dashboard.test_dashboard_fleet import (
@@ -35,9 +34,10 @@ from tests.companion.dashboard.test_dashboard_fleet import (
     two_vehicles,
 )
 from tests.companion.service_process import ServiceProcess
-from tests.companion.simulation.test_play import playing
+from tests.companion.test_play import playing
+from tests.programs import AXE
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240), needs_chromium]
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240), pytest.mark.needs("chromium")]
 
 SCENE = """
 [ground]
@@ -635,7 +635,7 @@ def violations(tab: Tab) -> list[str]:
     return [f"{one['id']}: {node['html'][:200]}" for one in found for node in one["nodes"]]
 
 
-@needs_axe
+@pytest.mark.needs("axe-core")
 @pytest.mark.parametrize("look", LOOKS)
 def test_page_is_accessible(window: Tab, look: str) -> None:
     with populated(window, look) as (tab, shown, end_service):

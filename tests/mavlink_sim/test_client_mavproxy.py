@@ -1,16 +1,14 @@
 """MAVProxy as a ground station, driven by typed commands.
 
-MAVProxy is GPL, and asks for matplotlib, VTK and another OpenCV; it is a tool of this test alone, for which
-`pip install --no-deps MAVProxy pyserial` is enough. Without it the test is skipped.
+MAVProxy is GPL, and asks for matplotlib, VTK and another OpenCV: it is a tool of this test alone, in an
+environment of its own (`make programs`).
 """
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -20,14 +18,9 @@ import pytest
 
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M
 from mavlink_sim.testing import RunningSimulator, vehicle
+from tests.programs import MAVPROXY
 
-pytestmark = [
-    pytest.mark.skipif(
-        importlib.util.find_spec("MAVProxy") is None or importlib.util.find_spec("serial") is None,
-        reason="MAVProxy is not installed: pip install --no-deps MAVProxy pyserial",
-    ),
-    pytest.mark.realtime,
-]
+pytestmark = [pytest.mark.needs("MAVProxy"), pytest.mark.realtime]
 MODULES = "param,arm,mode,wp,cmdlong,link,misc"
 # PX4's main and sub modes: MAVProxy 1.8.75 knows their names, but hands pymavlink all three numbers as one
 TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"
@@ -39,9 +32,10 @@ class Console:
     def __init__(self, device: str, folder: Path) -> None:
         self.output: list[str] = []
         self._changed = threading.Condition()
+        assert MAVPROXY is not None
         self.process = subprocess.Popen(
             [
-                *(sys.executable, "-u", "-m", "MAVProxy.mavproxy", f"--master={device}"),
+                *(MAVPROXY, f"--master={device}"),
                 *(f"--state-basedir={folder}", f"--default-modules={MODULES}", "--aircraft=test"),
             ],
             stdin=subprocess.PIPE,
@@ -49,7 +43,7 @@ class Console:
             stderr=subprocess.STDOUT,
             text=True,
             cwd=folder,
-            env={**os.environ, "HOME": str(folder)},  # nobody's .mavinit.scr
+            env={**os.environ, "HOME": str(folder), "PYTHONUNBUFFERED": "1"},  # nobody's .mavinit.scr
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()

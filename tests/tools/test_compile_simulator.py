@@ -5,7 +5,6 @@ Run as a program, this file prints what it flew.
 
 import hashlib
 import os
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -24,7 +23,6 @@ from mavlink_sim.physics import airframe
 from tools.compile_simulator import MODULES, compile_simulator
 
 ROOT = Path(__file__).parents[2]
-COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
 
 
 def episodes(name: str, seed: int, count: int = 2, steps: int = 100) -> str:
@@ -61,7 +59,7 @@ def flown(*paths: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.skipif(shutil.which(COMPILER) is None, reason=f"there is no C compiler {COMPILER}")
+@pytest.mark.needs("C compiler")
 def test_compiled_flights_equal_the_pure_ones(tmp_path: Path) -> None:
     compile_simulator(tmp_path / "compiled")
     pure, compiled = flown(ROOT), flown(tmp_path / "compiled", ROOT)

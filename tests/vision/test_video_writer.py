@@ -21,7 +21,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.companion.dashboard.programs import CHROMIUM, needs_chromium
+from tests.programs import CHROMIUM
 from vision import video_writer
 from vision.video_writer import VideoWriter, VideoWriterError
 
@@ -247,7 +247,7 @@ class Cinema(SimpleHTTPRequestHandler):
         pass
 
 
-@needs_chromium
+@pytest.mark.needs("chromium")
 @pytest.mark.realtime
 def test_browser_plays_the_video_to_its_end(tmp_path: Path) -> None:
     assert CHROMIUM is not None

@@ -6,7 +6,6 @@ import asyncio
 import json
 import queue
 import re
-import shutil
 import socket
 import subprocess
 from pathlib import Path
@@ -25,7 +24,7 @@ from tests.companion.dashboard.serving import POST, EventStream, request
 
 pytestmark = [
     pytest.mark.realtime,
-    pytest.mark.skipif(shutil.which("openssl") is None, reason="needs the program openssl"),
+    pytest.mark.needs("openssl"),
 ]
 PAGE = (Path(__file__).parents[3] / "docs" / "how-to" / "zenoh-security.md").read_text()
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.companion.dashboard.programs import CHROMIUM
+from tests.programs import CHROMIUM
 
 _ANSWER_S = 30.0
 

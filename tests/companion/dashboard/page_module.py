@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import companion.dashboard
-from tests.companion.dashboard.programs import NODE
+from tests.programs import NODE
 
 PAGE = Path(companion.dashboard.__file__).parent / "page"
 

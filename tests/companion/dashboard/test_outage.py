@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from tests.companion.dashboard.page_module import evaluate
-from tests.companion.dashboard.programs import needs_node
 
-pytestmark = needs_node
+pytestmark = pytest.mark.needs("node")
 
 SILENCE = "without setpoints PX4 holds its position after 1.1 s"
 KNOWN = {

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from tests.companion.dashboard.page_module import evaluate
-from tests.companion.dashboard.programs import needs_node
+import pytest
 
-pytestmark = needs_node
+from tests.companion.dashboard.page_module import evaluate
+
+pytestmark = pytest.mark.needs("node")
 
 FLOWN = {"command_id": "s-4", "state": "in_progress", "success": True, "reason": "in progress"}
 SHOWN = """

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import random
 
+import pytest
+
 from tests.companion.dashboard.page_module import evaluate
-from tests.companion.dashboard.programs import needs_node
 from tests.vision.test_labels import IMAGE, has_room, overlapping
 from vision.labels import Rectangle
 
-pytestmark = needs_node
+pytestmark = pytest.mark.needs("node")
 
 PLACED = """
 given.map(({ boxes, size, image }) => {

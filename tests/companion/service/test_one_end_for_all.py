@@ -13,10 +13,10 @@ from companion import connect
 from companion.bus.client import listen
 from mavlink_sim.testing import QUICK_FLIGHT, running_simulator
 from tests.companion.dashboard.page_module import evaluate
-from tests.companion.dashboard.programs import NODE
 from tests.companion.dashboard.serving import EventStream, serving
 from tests.companion.dashboard.test_outcome import SHOWN
 from tests.companion.service_process import ServiceProcess, running_service
+from tests.programs import NODE
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 

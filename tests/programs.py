@@ -1,0 +1,80 @@
+"""What tests need beyond Python packages. `make programs` installs what can be installed.
+
+A test with `pytest.mark.needs(name)` is left out where that is not here; it fails with
+COMPANION_TEST_PROGRAMS=required, as in `.ci/run`. `python -m tests.programs` says in one line what is left
+out and how to get it; `python -m tests.programs debian` names the packages of Debian that are missing.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import sysconfig
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+HERE = Path(__file__).parent
+REQUIRED = os.environ.get("COMPANION_TEST_PROGRAMS") == "required"
+DATA = Path(os.environ.get("COMPANION_TEST_DATA", HERE.parents[1] / "shared" / "data"))
+AXE = HERE / "companion" / "dashboard" / "node_modules" / "axe-core" / "axe.min.js"
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+NODE = shutil.which("node")
+# GPL, and its requirements would replace the headless OpenCV: it has an environment of its own.
+MAVPROXY = shutil.which("mavproxy.py", path=str(HERE.parent / ".venv-mavproxy" / "bin")) or shutil.which(
+    "mavproxy.py"
+)
+COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
+
+MAKE = "`make programs`, on Debian as root"
+
+
+class Need(NamedTuple):
+    """Something that tests need.
+
+    Attributes:
+        here: whether it is here.
+        tests: what is left out without it.
+        get: how to get it.
+        debian: Debian's package with it, or with what installs it.
+    """
+
+    here: bool
+    tests: str
+    get: str = MAKE
+    debian: str = ""
+
+
+def program(name: str, tests: str, debian: str) -> Need:
+    return Need(shutil.which(name) is not None, tests, debian=debian)
+
+
+NEEDS = {
+    "chromium": Need(CHROMIUM is not None, "the page in a browser", debian="chromium"),
+    "node": program("node", "the page's functions", "nodejs"),
+    "axe-core": Need(AXE.is_file(), "the page's accessibility", debian="" if shutil.which("npm") else "npm"),
+    "MAVProxy": Need(MAVPROXY is not None, "MAVProxy as a client"),
+    "openssl": program("openssl", "zenoh with TLS", "openssl"),
+    "systemd-analyze": program("systemd-analyze", "the exposure of the units", "systemd"),
+    "C compiler": program(COMPILER, "the compiled simulator", "gcc"),
+    "autopilot": Need("COMPANION_SITL_URL" in os.environ, "SITL", "docs/how-to/sitl.md"),
+    "test data": Need(DATA.is_dir(), "real flights, photographs and networks", "COMPANION_TEST_DATA"),
+}
+
+
+def left_out(needs: Mapping[str, Need] = NEEDS) -> str:
+    """One line on the tests that are left out, and how to get them; empty if none is."""
+    missing: dict[str, list[str]] = {}
+    for name, need in needs.items():
+        if not need.here:
+            missing.setdefault(need.get, []).append(f"{need.tests} (no {name})")
+    if not missing:
+        return ""
+    return "left out: " + "; ".join(f"{', '.join(tests)}: {get}" for get, tests in missing.items())
+
+
+if __name__ == "__main__":
+    packages = [need.debian for need in NEEDS.values() if need.debian and not need.here]
+    if line := " ".join(packages) if sys.argv[1:] == ["debian"] else left_out():
+        print(line)
