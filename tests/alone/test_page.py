@@ -34,7 +34,7 @@ from tests.companion.dashboard.test_dashboard_fleet import (
     two_vehicles,
 )
 from tests.companion.service_process import ServiceProcess
-from tests.companion.test_play import playing
+from tests.companion.simulation.test_play import playing
 from tests.programs import AXE
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240), pytest.mark.needs("chromium")]
