@@ -97,7 +97,7 @@ def print(
     """
     with gc_paused():
         from companion.simulation.campaign import numbers_of
-        from vision.marker_sheets import marker_sheets, paper_of
+        from vision.calibration.marker_sheets import marker_sheets, paper_of
         from vision.markers import markers_in
 
     with plain_errors(ValueError, OSError):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from vision.calibration.marker_sheets import marker_sheets, paper_of
 from vision.camera_model import CameraModel
 from vision.marker_dictionaries import DICTIONARIES
-from vision.marker_sheets import marker_sheets, paper_of
 from vision.markers import Marker, MarkerDetector, MarkerKind, is_apriltag, marker_modules
 
 # Id 0 inside its black border, upright: as AprilRobotics publishes it; 36h10 by the code in its library.
