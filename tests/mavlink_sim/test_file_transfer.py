@@ -21,16 +21,9 @@ from mavsdk.plugins.component_metadata import MetadataType
 from pymavlink import mavftp, mavutil
 
 from mavlink_sim.px4.parameters import Parameters, default_parameters
-from mavlink_sim.services.file_transfer import (
-    DATA_BYTES,
-    Failure,
-    FileSystem,
-    Opcode,
-    Packet,
-    Server,
-    resolve,
-)
-from mavlink_sim.services.vehicle_files import bson
+from mavlink_sim.services.file_system import FileSystem, resolve
+from mavlink_sim.services.file_transfer import DATA_BYTES, WRITES, Failure, Opcode, Packet, Server
+from mavlink_sim.services.vehicle_files import bson, event_metadata
 from mavlink_sim.testing import RunningSimulator, running_simulator
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness
@@ -79,13 +72,6 @@ class Client:
         assert (answer.opcode, answer.requested) == (Opcode.NAK, opcode)
         return tuple(answer.data)
 
-    def upload(self, path: bytes, content: bytes) -> None:
-        self.ack(Opcode.CREATE_FILE, path)
-        for start in range(0, len(content), DATA_BYTES):
-            part = content[start : start + DATA_BYTES]
-            assert self.ack(Opcode.WRITE_FILE, part, start).data == struct.pack("<I", len(part))
-        self.ack(Opcode.TERMINATE_SESSION)
-
     def list(self, path: bytes) -> list[bytes]:
         return self.ack(Opcode.LIST_DIRECTORY, path).data.rstrip(b"\0").split(b"\0")
 
@@ -109,17 +95,15 @@ def test_the_root_lists_what_px4_has_there(client: Client) -> None:
 
 
 def test_storage_card_path_is_the_root(client: Client) -> None:
-    client.upload(b"/fs/microsd/note.txt", b"hello")
-    assert b"Fnote.txt\t5" in client.list(b"")
-    client.ack(Opcode.REMOVE_FILE, b"note.txt")
-    assert b"Fnote.txt\t5" not in client.list(b"/fs/microsd")
+    client.harness.vehicle.files.provide("note.txt", lambda: b"hello")
+    for path in (b"", b"/fs/microsd"):
+        assert b"Fnote.txt\t5" in client.list(path)
 
 
 def test_long_list_is_split_by_offset(client: Client) -> None:
-    client.ack(Opcode.CREATE_DIRECTORY, b"many")
     names = [f"file-number-{number:03d}" for number in range(30)]
     for name in names:
-        client.upload(f"many/{name}".encode(), b"")
+        client.harness.vehicle.files.provide(f"many/{name}", lambda: b"")
     found: list[bytes] = []
     while True:
         (answer,) = client.ask(Opcode.LIST_DIRECTORY, b"many", len(found))
@@ -130,9 +114,9 @@ def test_long_list_is_split_by_offset(client: Client) -> None:
     assert found == [b"S", b"S"] + [f"F{name}\t0".encode() for name in names]
 
 
-def test_written_file_is_read_and_burst(client: Client) -> None:
+def test_a_file_is_read_and_burst(client: Client) -> None:
     content = os.urandom(5000)
-    client.upload(b"log/flight.ulg", content)
+    client.harness.vehicle.files.provide("log/flight.ulg", lambda: content)
     assert client.ack(Opcode.OPEN_FILE_RO, b"log/flight.ulg").data == struct.pack("<I", 5000)
     assert client.ack(Opcode.READ_FILE, b"", 4900, size=239).data == content[4900:]
     assert client.nak(Opcode.READ_FILE, b"", 5000, size=239) == (Failure.END_OF_FILE,)
@@ -147,8 +131,7 @@ def test_written_file_is_read_and_burst(client: Client) -> None:
 
 def test_burst_pauses_after_35_kb_and_continues_at_offset(client: Client) -> None:
     content = os.urandom(100_000)
-    files = client.harness.vehicle.files
-    files.write(files.create("big", True), 0, content)
+    client.harness.vehicle.files.provide("big", lambda: content)
     client.ack(Opcode.OPEN_FILE_RO, b"big")
     got = b""
     rounds = 0
@@ -171,7 +154,7 @@ def test_one_session_per_link_closes_after_10_s(client: Client) -> None:
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
     assert client.nak(Opcode.OPEN_FILE_RO, b"parameters.bson") == (Failure.NO_SESSIONS_AVAILABLE,)
     client.harness.fly(9.0)
-    assert client.nak(Opcode.CREATE_FILE, b"x") == (Failure.NO_SESSIONS_AVAILABLE,)
+    assert client.nak(Opcode.OPEN_FILE_RO, b"x") == (Failure.NO_SESSIONS_AVAILABLE,)
     client.harness.fly(10.1)
     assert client.nak(Opcode.READ_FILE, size=4) == (Failure.INVALID_SESSION,)
     client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
@@ -180,10 +163,10 @@ def test_one_session_per_link_closes_after_10_s(client: Client) -> None:
 
 
 def test_repeated_request_executed_once(client: Client) -> None:
-    client.ack(Opcode.CREATE_DIRECTORY, b"once")
-    (again,) = client.repeat(Opcode.CREATE_DIRECTORY, b"once")
+    client.ack(Opcode.OPEN_FILE_RO, b"parameters.bson")
+    (again,) = client.repeat(Opcode.OPEN_FILE_RO, b"parameters.bson")
     assert again.opcode == Opcode.ACK
-    assert client.nak(Opcode.CREATE_DIRECTORY, b"once") == (Failure.FILE_EXISTS,)
+    assert client.nak(Opcode.OPEN_FILE_RO, b"parameters.bson") == (Failure.NO_SESSIONS_AVAILABLE,)
 
 
 @pytest.mark.parametrize(
@@ -193,25 +176,15 @@ def test_repeated_request_executed_once(client: Client) -> None:
         (Opcode.OPEN_FILE_RO, b"nowhere", (Failure.FILE_NOT_FOUND,)),
         (Opcode.OPEN_FILE_RO, b"@PARAM/param.pck", (Failure.FILE_NOT_FOUND,)),  # ArduPilot's; PX4 has none
         (Opcode.OPEN_FILE_RO, b"etc", (Failure.FAIL_ERRNO, errno.EISDIR)),
-        (Opcode.CREATE_FILE, b"nowhere/x", (Failure.FILE_NOT_FOUND,)),
-        (Opcode.CREATE_FILE, b"log", (Failure.FAIL_ERRNO, errno.EISDIR)),
-        (Opcode.CREATE_FILE, b"parameters.bson", (Failure.FILE_PROTECTED,)),
-        (Opcode.REMOVE_FILE, b"parameters.bson", (Failure.FILE_PROTECTED,)),
-        (Opcode.REMOVE_FILE, b"nowhere", (Failure.FILE_NOT_FOUND,)),
-        (Opcode.REMOVE_DIRECTORY, b"etc", (Failure.FILE_PROTECTED,)),
-        (Opcode.REMOVE_DIRECTORY, b"/", (Failure.FILE_PROTECTED,)),
-        (Opcode.CREATE_DIRECTORY, b"log", (Failure.FILE_EXISTS,)),
-        (Opcode.CREATE_DIRECTORY, b"a/b", (Failure.FILE_NOT_FOUND,)),
-        (Opcode.RENAME, b"nowhere\0there\0", (Failure.FILE_NOT_FOUND,)),
-        (Opcode.RENAME, b"log", (Failure.FAIL_ERRNO, errno.EINVAL)),
-        (Opcode.TRUNCATE_FILE, b"nowhere", (Failure.FILE_NOT_FOUND,)),
+        (Opcode.OPEN_FILE_RO, b"parameters.bson/x", (Failure.FAIL_ERRNO, errno.ENOTDIR)),
+        (Opcode.LIST_DIRECTORY, b"parameters.bson", (Failure.FAIL_ERRNO, errno.ENOTDIR)),
         (Opcode.CALC_FILE_CRC32, b"nowhere", (Failure.FILE_NOT_FOUND,)),
         (Opcode.READ_FILE, b"", (Failure.INVALID_SESSION,)),
         (Opcode.BURST_READ_FILE, b"", (Failure.INVALID_SESSION,)),
-        (Opcode.WRITE_FILE, b"x", (Failure.INVALID_SESSION,)),
         (Opcode.TERMINATE_SESSION, b"", (Failure.INVALID_SESSION,)),
         (77, b"", (Failure.UNKNOWN_COMMAND,)),
         (Opcode.ACK, b"", (Failure.UNKNOWN_COMMAND,)),
+        *((opcode, b"log/x", (Failure.FILE_PROTECTED,)) for opcode in sorted(WRITES)),
     ],
 )
 def test_failures_have_px4s_codes(client: Client, opcode: int, data: bytes, failure: tuple[int, ...]) -> None:
@@ -222,34 +195,16 @@ def test_a_size_beyond_the_payload_is_refused(client: Client) -> None:
     assert client.nak(Opcode.OPEN_FILE_RO, b"x", size=240) == (Failure.INVALID_DATA_SIZE,)
 
 
-def test_files_are_renamed_truncated_summed_and_removed(client: Client) -> None:
-    client.upload(b"one", b"123456789")
+def test_checksum_of_a_file_is_px4s_variant(client: Client) -> None:
+    client.harness.vehicle.files.provide("one", lambda: b"123456789")
     # the check value of this CRC-32 variant (no inversions), as PX4 computes it
     assert client.ack(Opcode.CALC_FILE_CRC32, b"one").data == struct.pack("<I", 0x2DFD2D88)
-    client.ack(Opcode.RENAME, b"one\0log/two\0")
-    client.ack(Opcode.TRUNCATE_FILE, b"log/two", 4)
-    assert client.list(b"log") == [b"S", b"S", b"Ftwo\t4"]
-    assert client.nak(Opcode.REMOVE_DIRECTORY, b"log") == (Failure.FAIL_ERRNO, errno.ENOTEMPTY)
-    assert client.nak(Opcode.TRUNCATE_FILE, b"log/two", 2**32 - 1) == (Failure.FAIL_ERRNO, errno.ENOSPC)
-    client.ack(Opcode.REMOVE_FILE, b"log/two")
-    client.ack(Opcode.REMOVE_DIRECTORY, b"log")
 
 
 def test_the_host_cannot_be_reached(client: Client) -> None:
     here = Path(__file__).resolve()
     for path in (str(here), "../../../../../../etc/passwd", "/etc/passwd", "..\\..", f"etc/../..{here}"):
         assert client.nak(Opcode.OPEN_FILE_RO, path.encode()) == (Failure.FILE_NOT_FOUND,)
-
-
-def test_the_card_is_full_at_its_capacity() -> None:
-    files = FileSystem(capacity_bytes=1000)
-    files.write(files.create("a", True), 0, bytes(600))
-    b = files.create("b", True)
-    with pytest.raises(OSError, match="No space") as full:
-        files.write(b, 0, bytes(401))
-    assert full.value.errno == errno.ENOSPC
-    files.remove("a")
-    assert files.write(b, 0, bytes(1000)) == 1000
 
 
 @given(st.lists(st.sampled_from(["a", "..", ".", "", "fs", "microsd", "etc"]), max_size=12))
@@ -269,7 +224,7 @@ def test_no_path_leads_above_the_root(names: list[str]) -> None:
     )
 )
 def test_any_payload_is_answered(requests: list[tuple[int, bytes, int, int]]) -> None:
-    files = FileSystem(capacity_bytes=5000)
+    files = FileSystem()
     files.provide("etc/file", lambda: b"content")
     server = Server(files)
     for number, (opcode, data, offset, size) in enumerate(requests):
@@ -277,6 +232,13 @@ def test_any_payload_is_answered(requests: list[tuple[int, bytes, int, int]]) ->
         reply = server.answer((header + data).ljust(251, b"\0"), (1, 191), number * 0.1)
         assert reply is None or len(reply) == 251
         assert all(len(payload) == 251 for _, payload in server.burst(number * 0.1))
+
+
+def test_a_file_is_generated_at_each_read() -> None:
+    files = FileSystem()
+    contents = iter([b"one", b"two"])
+    files.provide("etc/now", lambda: next(contents))
+    assert [files.read("etc/now"), files.read("/etc/now")] == [b"one", b"two"]
 
 
 # ---- what is in the files
@@ -343,35 +305,26 @@ async def collect(transfer: Any) -> list[Any]:
     return [progress async for progress in transfer]
 
 
-async def test_mavsdk_lists_loads_stores_compares_renames_and_removes(
-    simulator: RunningSimulator, tmp_path: Path
-) -> None:
-    content = os.urandom(20_000)
-    (tmp_path / "there").mkdir()
-    (tmp_path / "file.bin").write_bytes(content)
+async def test_mavsdk_lists_loads_and_compares(simulator: RunningSimulator, tmp_path: Path) -> None:
+    folder, name = "/etc/extras", "all_events.json.xz"
     async with mavsdk_client(f"udpin://127.0.0.1:{simulator.gcs_port}") as system:
         ftp = system.plugin(FtpAsync)
         root = await ftp.list_directory("/")
         names = {entry.name for entry in root.entries}
         assert names == {"etc", "log", "parameters.bson", "parameters_backup.bson"}
-        await ftp.create_directory("/log/mine")
-        with pytest.raises(FtpError, match="FILE_EXISTS"):
-            await ftp.create_directory("/log/mine")
-        await collect(ftp.upload(str(tmp_path / "file.bin"), "/log/mine"))
-        (entry,) = (await ftp.list_directory("/log/mine")).entries
-        assert (entry.name, entry.size_bytes) == ("file.bin", len(content))
-        assert await ftp.are_files_identical(str(tmp_path / "file.bin"), "/log/mine/file.bin")
-        await ftp.rename("/log/mine/file.bin", "/log/mine/other.bin")
+        assert (await ftp.list_directory("/log")).entries == []
+        (size,) = (e.size_bytes for e in (await ftp.list_directory(folder)).entries if e.name == name)
+        loaded = tmp_path / name
         for burst in (False, True):
-            await collect(ftp.download("/log/mine/other.bin", str(tmp_path / "there"), burst))
-            loaded = tmp_path / "there" / "other.bin"
-            assert loaded.read_bytes() == content
+            await collect(ftp.download(f"{folder}/{name}", str(tmp_path), burst))
+            assert loaded.stat().st_size == size
+            assert lzma.decompress(loaded.read_bytes()) == event_metadata()
+            assert await ftp.are_files_identical(str(loaded), f"{folder}/{name}")
             loaded.unlink()
         with pytest.raises(FtpError):
-            await collect(ftp.download("/nowhere", str(tmp_path / "there"), False))
-        await ftp.remove_file("/log/mine/other.bin")
-        await ftp.remove_directory("/log/mine")
-        assert (await ftp.list_directory("/log")).entries == []
+            await collect(ftp.download("/nowhere", str(tmp_path), False))
+        with pytest.raises(FtpError, match="PROTECTED"):
+            await ftp.create_directory("/log/mine")
 
 
 async def test_mavsdk_finds_the_metadata(simulator: RunningSimulator) -> None:
@@ -391,10 +344,8 @@ async def test_mavsdk_finds_the_metadata(simulator: RunningSimulator) -> None:
         assert "components" in json.loads(events.json_metadata)
 
 
-def test_pymavlinks_own_client_stores_and_loads(simulator: RunningSimulator, tmp_path: Path) -> None:
-    content = os.urandom(30_000)
-    source, target = tmp_path / "source", tmp_path / "target"
-    source.write_bytes(content)
+def test_pymavlinks_own_client_loads_a_file(simulator: RunningSimulator, tmp_path: Path) -> None:
+    target = tmp_path / "target"
     link = mavutil.mavlink_connection(
         f"udpin:127.0.0.1:{simulator.onboard_port}", source_system=1, source_component=191
     )
@@ -405,10 +356,8 @@ def test_pymavlinks_own_client_stores_and_loads(simulator: RunningSimulator, tmp
         ftp.cmd_list(["/"])
         ftp.process_ftp_reply("ListDirectory", timeout=10)
         assert ftp.list_result
-        assert ftp.cmd_put([str(source), "log/flight"]).error_code == 0
-        assert ftp.process_ftp_reply("CreateFile", timeout=30).error_code == 0
-        assert ftp.cmd_get(["log/flight", str(target)]).error_code == 0
+        assert ftp.cmd_get(["etc/extras/all_events.json.xz", str(target)]).error_code == 0
         assert ftp.process_ftp_reply("OpenFileRO", timeout=30).error_code == 0
-        assert target.read_bytes() == content
+        assert lzma.decompress(target.read_bytes()) == event_metadata()
     finally:
         link.close()
