@@ -45,7 +45,7 @@ from companion.service.requests import apply_output
 from companion.vehicle.gimbal import NOBODY, Address, GimbalAim, GimbalState, YawFrame
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, VehicleState, with_fields
 from companion.vehicle.streamer import Streamer
 from mavlink_sim.lockstep import LockstepVehicle
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle, SeenObject, look
@@ -155,7 +155,7 @@ class ScriptedAutopilot:
     @property
     def state(self) -> VehicleState:
         armed, mode = self._shown
-        return replace(
+        return with_fields(
             self.vehicle.state,
             heartbeat_ns=self._heartbeat_ns,
             position_ns=self._position_ns,
@@ -381,7 +381,9 @@ class GuidanceHarness:
     def _state(self) -> VehicleState:
         """The vehicle's state, stamped by the companion's clock."""
         state, late_ns = self.autopilot.state, self._suspended_ns
-        return replace(
+        if not late_ns:
+            return state
+        return with_fields(
             state,
             heartbeat_ns=state.heartbeat_ns - late_ns,
             position_ns=state.position_ns - late_ns,
@@ -446,7 +448,7 @@ def assert_failed(outcome: BehaviourOutput | None, *words: str) -> Outcome:
 
 def with_state(**changes: Any) -> Callable[[GuidanceInput], GuidanceInput]:
     """Inputs with another state."""
-    return lambda inputs: replace(inputs, state=replace(inputs.state, **changes))
+    return lambda inputs: replace(inputs, state=with_fields(inputs.state, **changes))
 
 
 def known(value: T | None) -> T:

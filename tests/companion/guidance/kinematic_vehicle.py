@@ -9,10 +9,12 @@ from typing import Any
 
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState
+from companion.vehicle.state import FlightMode, LandedState, Vector3, VehicleState, with_fields
 from vision.attitude import quaternion_from_euler, wrap_angle
 
 START_NS = 1_000_000_000_000
+# What does not change in flight.
+STATE = VehicleState(ready_to_arm=True, home_altitude_amsl_m=489.0, home_position_ned_m=(0.0, 0.0, 0.0))
 
 
 @dataclass
@@ -36,19 +38,17 @@ class KinematicVehicle:
 
     @property
     def state(self) -> VehicleState:
-        return VehicleState(
+        return with_fields(
+            STATE,
             heartbeat_ns=self.now_ns,
             attitude_ns=self.now_ns,
             position_ns=self.now_ns,
             armed=self.armed,
             mode=self.mode,
             landed=self.landed,
-            ready_to_arm=True,
             position_ned_m=self.position_ned_m,
             velocity_ned_mps=self.estimated_velocity,
             attitude=quaternion_from_euler(0.0, 0.0, self.yaw_rad),
-            home_altitude_amsl_m=489.0,
-            home_position_ned_m=(0.0, 0.0, 0.0),
         )
 
     @property

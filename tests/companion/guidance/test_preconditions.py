@@ -23,7 +23,7 @@ from companion.guidance.missions.sequence import SequenceBehaviour
 from companion.guidance.mode_control import Phase
 from companion.guidance.objects.from_markers import NO_MARKERS, MarkerSight
 from companion.guidance.objects.ranging import RangeMeans
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode, LandedState, with_fields
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
     Pending,
@@ -80,7 +80,7 @@ class World:
     def inputs(self, inputs: GuidanceInput) -> GuidanceInput:
         now_ns = inputs.state.heartbeat_ns
         if not self.home:
-            inputs = replace(inputs, state=replace(inputs.state, home_altitude_amsl_m=None))
+            inputs = replace(inputs, state=with_fields(inputs.state, home_altitude_amsl_m=None))
         parts: dict[str, Any] = {
             "neighbourhood": Neighbourhood("own", (LEADER,)),
             "markers": MARKERS,

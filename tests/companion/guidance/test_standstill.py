@@ -10,7 +10,7 @@ from companion.guidance.core import GuidanceOptions
 from companion.guidance.formation.neighbours import Neighbour, Neighbourhood
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.vehicle.state import FlightMode, LandedState
+from companion.vehicle.state import FlightMode, LandedState, with_fields
 from companion.vehicle.vehicle_type import VtolState
 from tests.companion.guidance.guidance_harness import (
     GuidanceHarness,
@@ -217,7 +217,7 @@ class SilentUntilReceived:
     received = False
 
     def __call__(self, inputs: GuidanceInput) -> GuidanceInput:
-        state = inputs.state if self.received else replace(inputs.state, heartbeat_ns=0, position_ns=0)
+        state = inputs.state if self.received else with_fields(inputs.state, heartbeat_ns=0, position_ns=0)
         return replace(with_leader(inputs), state=state)
 
 
