@@ -75,9 +75,7 @@ def test_example_bodies_in_the_document_are_valid() -> None:
         "tracks",
         "pose",
         "markers",
-        "depth",
         "camera_info",
-        "transforms",
         "velocity",
         "command_state",
     }
