@@ -11,11 +11,12 @@ import numpy as np
 from companion.bench.lockstep_flight import plain_settings
 from companion.bench.synthetic_detector import SceneObject
 from companion.settings import Settings
+from companion.settings.calibration import adopt_calibration
 from companion.vehicle.state import Vector3
 from mavlink_sim.camera.depth_camera import DepthSensor
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.world.world import Ground, Light, Sky, World, WorldObject
-from vision.camera_model import CameraModel, CameraMount
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 
 # Where what is hidden is taken to.
 AWAY_M = 2000.0
@@ -28,24 +29,9 @@ def camera_settings(
 
     The network computes in float32: `auto` measures, and would select another precision on another machine.
     """
-    values = {
-        "detector.precision": "float32",
-        "camera.fx_px": camera.fx,
-        "camera.fy_px": camera.fy,
-        "camera.cx_px": camera.cx,
-        "camera.cy_px": camera.cy,
-        "camera.calibrated_width": camera.width,
-        "camera.calibrated_height": camera.height,
-        "camera.mount_forward_m": mount.forward_m,
-        "camera.mount_right_m": mount.right_m,
-        "camera.mount_down_m": mount.down_m,
-        "camera.mount_roll_deg": math.degrees(mount.roll_rad),
-        "camera.mount_pitch_deg": math.degrees(mount.pitch_rad),
-        "camera.mount_yaw_deg": math.degrees(mount.yaw_rad),
-        "camera.stabilized": str(mount.stabilized).lower(),
-        "camera.on_gimbal": str(mount.on_gimbal).lower(),
-    }
-    return plain_settings({key: str(value) for key, value in values.items()} | dict(changes or {}))
+    settings = plain_settings({"detector.precision": "float32"} | dict(changes or {}))
+    adopted = adopt_calibration(settings.camera, CameraCalibration(camera, mount)).camera
+    return settings.model_copy(update={"camera": adopted})
 
 
 def rendered_scene(

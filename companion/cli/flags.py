@@ -99,7 +99,7 @@ def with_default(name: str) -> type[typer.core.TyperGroup]:
 
 
 def _renamed_flag(flag: str) -> str | None:
-    from companion.settings.reading import RENAMED
+    from companion.settings.former import REMOVED, RENAMED, VERSION
 
     if flag.startswith("--views-"):
         return (
@@ -107,9 +107,10 @@ def _renamed_flag(flag: str) -> str | None:
             "they stand in the settings file"
         )
     now = {_flag_of(old): _flag_of(new) for old, new in RENAMED.items()}.get(flag)
-    if now is None:
-        return None
-    return f"{flag} was renamed to {now} in version 0.2.0; this command has no such option"
+    if now is not None:
+        return f"{flag} was renamed to {now} in version {VERSION}; this command has no such option"
+    instead = {_flag_of(old): removed.instead for old, removed in REMOVED.items()}.get(flag)
+    return None if instead is None else f"{flag} was removed in version {VERSION}: {instead}"
 
 
 def _flag_of(key: str) -> str:
@@ -274,7 +275,8 @@ def _declare(function: Any, parameters: list[inspect.Parameter]) -> None:
 @functools.cache
 def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
     with gc_paused():
-        from companion.settings.reading import RENAMED, Flag, flags
+        from companion.settings.former import REMOVED, RENAMED
+        from companion.settings.reading import Flag, flags
     known = {name for flag in flags() for name in (flag.key, flag.key.partition(".")[0])}
     if unknown := set(keys) - known:
         raise ValueError(f"no such settings or sections: {', '.join(sorted(unknown))}")
@@ -287,10 +289,12 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
         or (flag.key.partition(".")[0] in wanted and flag.key not in _OF_THE_SERVICE)
     ]
     # Former names are hidden flags: using one is reported with all other errors of the settings.
-    former = [
-        Flag(old, str, None, "") for old, new in RENAMED.items() if new in {flag.key for flag in chosen}
-    ]
-    return {flag.key.replace(".", "__"): flag for flag in (*chosen, *former)}
+    taken = {flag.key for flag in chosen}
+    sections = {key.partition(".")[0] for key in taken}
+    former = [old for old, new in RENAMED.items() if new in taken]
+    former += [old for old in REMOVED if old.partition(".")[0] in sections]
+    hidden = [Flag(old, str, None, "") for old in former]
+    return {flag.key.replace(".", "__"): flag for flag in (*chosen, *hidden)}
 
 
 @functools.cache
@@ -300,7 +304,7 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
     def settings(**_values: Any) -> None:
         """Never run: typer creates parameters only for commands."""
 
-    from companion.settings.reading import RENAMED
+    from companion.settings.former import REMOVED, RENAMED
 
     parameters = []
     for name, flag in _flags_by_parameter(keys).items():
@@ -316,7 +320,7 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
                 help=flag.help,
                 metavar=_METAVARS[flag.type],
                 panel=panel,
-                hidden=flag.key in RENAMED,
+                hidden=flag.key in RENAMED or flag.key in REMOVED,
             )
         )
     _declare(settings, parameters)

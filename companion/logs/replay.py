@@ -28,6 +28,7 @@ from companion.recording.files import RecordingReader
 from companion.recording.guidance_record import LAYOUT, inputs_of, output_record, read_step
 from companion.service.factory import guidance_options
 from companion.settings import Settings
+from companion.settings.former import without_removed
 from companion.settings.reading import ConfigurationError, changed
 
 MAX_LISTED, MAX_LISTED_CHANGES = 10, 25
@@ -111,8 +112,9 @@ def replay(paths: Sequence[Path], changes: Mapping[str, str], model: str | None 
         )
     try:
         options = decode(GuidanceOptions, run["options"])
-        recorded_settings = Settings.from_json(run["settings"])
-    except ValueError as error:  # also of pydantic
+        former: list[str] = []
+        recorded_settings = Settings.from_json(without_removed(run["settings"], former))
+    except (ValueError, LookupError, TypeError, AttributeError) as error:  # also of pydantic
         raise RecordingError(f"{paths[0]}: its settings cannot be read: {_first_line(error)}") from error
     options, changed_settings = _changed_options(options, recorded_settings, changes)
     found = Replay(run["vehicle"], run["version"], changed_settings)
@@ -121,7 +123,8 @@ def replay(paths: Sequence[Path], changes: Mapping[str, str], model: str | None 
     _step_all(paths, Guidance(options), perception, timeline, found)
     if perception is not None:
         found.detections, reasons = perception.result()
-        found.inexact += reasons
+        # Guidance alone gets what perception made with them.
+        found.inexact += former + reasons
     if not found.steps:
         raise RecordingError(f"{paths[0]}: has no steps of guidance")
     return found

@@ -36,6 +36,7 @@ from companion.recording.encoding import dumps
 from companion.recording.files import RecordingReader
 from companion.recording.guidance_record import RecordedStep
 from companion.settings import Settings
+from companion.settings.former import without_removed
 from companion.settings.perception import CameraSection, DetectorSection
 from vision.detections import TRACK_CONFIRMED, DetectionRecord
 from vision.frame import Frame
@@ -148,9 +149,8 @@ class PerceptionReplay:
         self._add_samples(recorded)
         if context.camera != self._section:
             self._section = context.camera
-            self._pipeline = self._new_pipeline(
-                CameraSection.model_validate(json.loads(context.camera), strict=False)
-            )
+            section = without_removed({"camera": json.loads(context.camera)}, [])["camera"]
+            self._pipeline = self._new_pipeline(CameraSection.model_validate(section, strict=False))
         if inputs.seen_ns is not None and inputs.seen_ns != self._seen_ns:
             self._seen_ns = inputs.seen_ns
             self._found.frames += 1

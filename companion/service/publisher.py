@@ -149,7 +149,7 @@ class Publisher:
             message = camera_info_message(
                 section.model(newest.width, newest.height),
                 section.mount(),
-                calibrated=section.fx_px is not None,
+                calibrated=section.lens is not None,
                 vehicle=self._vehicle,
                 view=camera.name,
                 now_ns=now_ns,

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from companion.settings.perception import LENS_KEYS, CameraSection, lens_settings
+from companion.settings.perception import CameraSection
 from vision.camera_model import CameraCalibration, CameraModel, CameraMount
 
-_DISTORTION = frozenset(("distortion", "distortion_model"))
-_LENS = LENS_KEYS - _DISTORTION
+_LENS = frozenset(("calibration_file", "horizontal_fov_deg", "lens"))
 _SAME_SHARE, _SAME_M, _SAME_DEG, _SAME_DISTORTION = 0.005, 0.001, 0.1, 1e-4
 """Tolerances of agreement: share of the frame's width for a lens, mount position and angle, coefficient."""
 
@@ -26,7 +25,7 @@ class AdoptedCamera(NamedTuple):
 def adopt_calibration(section: CameraSection, calibration: CameraCalibration) -> AdoptedCamera:
     """Use the camera's lens and mount, except for keys given in the settings, which take precedence.
 
-    The lens is one unit: if any of its keys is given, all come from the settings. The same holds for the
+    The lens is one unit: a given calibration or field of view replaces the camera's. The same holds for the
     reference of the mount's angles (`stabilized`, `on_gimbal`): if it differs, the angles come from the
     settings too. `conflict` lists each given value that differs, with the camera's; empty: none.
 
@@ -55,24 +54,21 @@ def adopt_calibration(section: CameraSection, calibration: CameraCalibration) ->
 def _adopt_lens(
     section: CameraSection, lens: CameraModel, given: set[str], changes: dict[str, Any], conflicts: list[str]
 ) -> None:
-    if given & _LENS:
-        own = section.model(lens.width, lens.height)
-        if any(
-            abs(getattr(own, name) - getattr(lens, name)) > _SAME_SHARE * lens.width
-            for name in ("fx", "fy", "cx", "cy")
-        ):
-            conflicts.append(f"lens {_lens_text(own)} (camera: {_lens_text(lens)})")
-    else:
-        changes |= {key: value for key, value in lens_settings(lens).items() if key in _LENS}
-    if not given & (_DISTORTION | _LENS):
-        changes |= {"distortion": lens.distortion, "distortion_model": lens.distortion_model}
+    if not given & _LENS:
+        changes["lens"] = lens
         return
-    if section.distortion_model != lens.distortion_model:
-        conflicts.append(f"distortion_model {section.distortion_model} (camera: {lens.distortion_model})")
+    own = section.model(lens.width, lens.height)
+    if any(
+        abs(getattr(own, name) - getattr(lens, name)) > _SAME_SHARE * lens.width
+        for name in ("fx", "fy", "cx", "cy")
+    ):
+        conflicts.append(f"lens {_lens_text(own)} (camera: {_lens_text(lens)})")
+    if own.distortion_model != lens.distortion_model:
+        conflicts.append(f"distortion_model {own.distortion_model} (camera: {lens.distortion_model})")
         return
-    own_terms, terms = (tuple(d) + (0.0,) * (8 - len(d)) for d in (section.distortion, lens.distortion))
+    own_terms, terms = (tuple(d) + (0.0,) * (8 - len(d)) for d in (own.distortion, lens.distortion))
     if any(abs(a - b) > _SAME_DISTORTION for a, b in zip(own_terms, terms, strict=True)):
-        conflicts.append(f"distortion {section.distortion} (camera: {lens.distortion})")
+        conflicts.append(f"distortion {own.distortion} (camera: {lens.distortion})")
 
 
 def _lens_text(model: CameraModel) -> str:

@@ -36,7 +36,7 @@ def sections_of_file() -> dict[str, type[Section]]:
 
 def fields_of_sections() -> dict[str, dict[str, FieldInfo]]:
     """Return section → name → field, in the order of the file; without further cameras."""
-    return {name: section.model_fields for name, section in sections_of_file().items()}
+    return {name: section.fields_by_key() for name, section in sections_of_file().items()}
 
 
 SECTIONS_OF_CAMERA = tuple(CameraSections.model_fields)

@@ -5,23 +5,15 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
 from companion.settings.marker_files import Print, read_boards, read_map
-from companion.settings.section import Section
+from companion.settings.section import NO_KEY, Section
 from companion.settings.texts import HEIGHT_TEXT, KEY_WORD, MARKER_TEXT
 from vision.calibration_files.camera_info import read_camera_info, read_registration
-from vision.camera_model import (
-    CameraModel,
-    CameraMount,
-    DistortionModel,
-    check_distortion,
-    pixels_without_rays,
-    scaled_to_frames,
-)
+from vision.camera_model import CameraModel, CameraMount, pixels_without_rays, scaled_to_frames
 from vision.class_names import fold_name
 from vision.frame import Frame
 from vision.frame_selection import Selection
@@ -97,15 +89,6 @@ class SourceSection(Section):
         return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
 
 
-# The keys of the lens; `camera.calibration_file` sets them all.
-LENS_KEYS = frozenset(
-    (
-        *("horizontal_fov_deg", "fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height"),
-        *("distortion", "distortion_model"),
-    )
-)
-
-
 # Focal length over the image's size: of a pinhole camera of 179° and of 1°.
 _LEAST_FOCAL, _MOST_FOCAL = 0.0043, 58.0
 
@@ -114,9 +97,9 @@ class CameraSection(Section):
     """Lens and mount; unset keys come from the camera's calibration, if any. Body: forward, right, down."""
 
     calibration_file: Annotated[str | None, Field(min_length=1)] = None
-    """ROS camera_info YAML, as `companion calibrate` writes it, instead of the keys of the lens"""
+    """the lens, as ROS camera_info YAML: `companion calibrate` writes it; instead of horizontal_fov_deg"""
     horizontal_fov_deg: Annotated[float, Field(gt=1, lt=179)] = 80.0
-    """horizontal field of view, degrees; unused when fx_px is set"""
+    """horizontal field of view of a lens without distortion, degrees; unused with calibration_file"""
     mount_forward_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
     """the camera's position forward of the autopilot, metres"""
     mount_right_m: Annotated[float, Field(ge=-10, le=10)] = 0.0
@@ -133,77 +116,33 @@ class CameraSection(Section):
     """a gimbal stabilizes the camera: roll and pitch are relative to the horizon, yaw to the nose"""
     on_gimbal: bool = False
     """the camera is on the autopilot's gimbal, which reports its attitude; mount angles are relative to it"""
-    fx_px: Annotated[float | None, Field(gt=0)] = None
-    """calibrated focal length along x, pixels; requires fy_px, cx_px, cy_px and calibrated_*"""
-    fy_px: Annotated[float | None, Field(gt=0)] = None
-    """calibrated focal length along y, pixels"""
-    cx_px: float | None = None
-    """calibrated principal point, pixels from the left"""
-    cy_px: float | None = None
-    """calibrated principal point, pixels from the top"""
-    calibrated_width: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """width of the calibration images, pixels"""
-    calibrated_height: Annotated[int | None, Field(ge=16, le=16384)] = None
-    """height of the calibration images, pixels"""
-    distortion: tuple[float, ...] = ()
-    """coefficients of distortion_model in OpenCV's order: k1, k2, p1, p2, k3; none: no distortion"""
     rolling_shutter_ms: Annotated[float, Field(ge=0, le=500)] = 0.0
     """time from the first row's exposure to the last row's, ms, for levelled images; 0: a global shutter"""
-    distortion_model: DistortionModel = "plumb_bob"
-    """plumb_bob; rational_polynomial: eight coefficients; equidistant (fisheye): k1, k2, k3, k4"""
+    lens: Annotated[CameraModel | None, NO_KEY] = None
+    """that of calibration_file, which is then recorded with the settings, or the camera's own"""
 
     @model_validator(mode="before")
     @classmethod
     def _with_calibration_file(cls, values: Any) -> Any:
-        """Replace the file by its numbers, which are then recorded with the other settings."""
+        """Read the file, unless its lens is here already: a recording is replayed without the file."""
         if not isinstance(values, dict) or not isinstance(file := values.get("calibration_file"), str):
             return values
-        if given := sorted(LENS_KEYS & values.keys()):
-            raise ValueError(f"calibration_file sets the lens, {', '.join(given)} too: remove one of them")
-        lens = read_camera_info(expanded(file)).model
-        others = {key: value for key, value in values.items() if key != "calibration_file"}
-        return others | lens_settings(lens)
+        if values.get("lens") is not None:
+            return values
+        if "horizontal_fov_deg" in values:
+            raise ValueError("calibration_file sets the lens, horizontal_fov_deg too: remove one of them")
+        return values | {"lens": read_camera_info(expanded(file)).model}
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        calibration = {
-            name: getattr(self, name)
-            for name in ("fx_px", "fy_px", "cx_px", "cy_px", "calibrated_width", "calibrated_height")
-        }
-        missing = [name for name, value in calibration.items() if value is None]
-        if missing and len(missing) < len(calibration):
-            raise ValueError(f"a calibration needs all of {', '.join(calibration)}; {missing[0]} is not set")
         if self.on_gimbal and self.stabilized:
             raise ValueError(
                 "on_gimbal and stabilized exclude each other: a gimbal reports its attitude (on_gimbal), "
                 "or one that reports nothing and holds the camera level (stabilized)"
             )
-        if not missing:
-            self._check_lens()
-        check_distortion(self.distortion_model, self.distortion)
-        if self.distortion_model == "equidistant" and missing:
-            raise ValueError(
-                "distortion_model equidistant needs a calibration: fx_px, fy_px… or calibration_file"
-            )
+        if self.lens is not None:
+            _check_lens(self.lens)
         return self
-
-    def _check_lens(self) -> None:
-        """Raise ValueError for a lens that no camera has: 179° to 1° across, the axis near the image."""
-        for axis, size, focal_px, centre_px in (
-            ("x", self.calibrated_width, self.fx_px, self.cx_px),
-            ("y", self.calibrated_height, self.fy_px, self.cy_px),
-        ):
-            if size is None or focal_px is None or centre_px is None:
-                continue
-            if not _LEAST_FOCAL * size <= focal_px <= _MOST_FOCAL * size:
-                raise ValueError(
-                    f"f{axis}_px of images of {size} pixels must be {_LEAST_FOCAL * size:.3g} to "
-                    f"{_MOST_FOCAL * size:.3g}, got {focal_px:g}"
-                )
-            if not -size <= centre_px <= 2 * size:
-                raise ValueError(
-                    f"c{axis}_px of images of {size} pixels must be {-size} to {2 * size}, got {centre_px:g}"
-                )
 
     def model(self, width: int, height: int) -> CameraModel:
         """Return the camera model for frames of this size, pixels.
@@ -211,42 +150,18 @@ class CameraSection(Section):
         Raises:
             ValueError: the lens was calibrated with images of another aspect.
         """
-        if (
-            self.fx_px is None
-            or self.fy_px is None
-            or self.cx_px is None
-            or self.cy_px is None
-            or self.calibrated_width is None
-            or self.calibrated_height is None
-        ):
-            fov_rad = math.radians(self.horizontal_fov_deg)
-            ideal = CameraModel.from_horizontal_fov(width, height, fov_rad)
-            return replace(ideal, distortion=self.distortion, distortion_model=self.distortion_model)
-        calibrated = CameraModel(
-            self.calibrated_width,
-            self.calibrated_height,
-            self.fx_px,
-            self.fy_px,
-            self.cx_px,
-            self.cy_px,
-            self.distortion,
-            self.distortion_model,
-        )
-        return scaled_to_frames(calibrated, width, height)
+        if self.lens is None:
+            return CameraModel.from_horizontal_fov(width, height, math.radians(self.horizontal_fov_deg))
+        return scaled_to_frames(self.lens, width, height)
 
     def lens_problem(self) -> str:
         """Where the image has no rays, in words; empty: nowhere, or there is no calibration."""
-        if self.calibrated_width is None or self.calibrated_height is None:
-            return ""
-        return pixels_without_rays(self.model(self.calibrated_width, self.calibrated_height))
+        return "" if self.lens is None else pixels_without_rays(self.lens)
 
     @property
     def field_rad(self) -> float:
         """Horizontal field of view, radians; from the calibration, if any."""
-        if self.fx_px is None or self.calibrated_width is None:
-            return math.radians(self.horizontal_fov_deg)
-        assert self.calibrated_height is not None
-        return self.model(self.calibrated_width, self.calibrated_height).horizontal_fov_rad
+        return math.radians(self.horizontal_fov_deg) if self.lens is None else self.lens.horizontal_fov_rad
 
     def mount(self) -> CameraMount:
         """Return the camera's mount on the body."""
@@ -262,8 +177,27 @@ class CameraSection(Section):
         )
 
 
+def _check_lens(lens: CameraModel) -> None:
+    """Raise ValueError for a lens that no camera has: 179° to 1° across, the axis near the image."""
+    for axis, size, focal_px, centre_px in (
+        ("x", lens.width, lens.fx, lens.cx),
+        ("y", lens.height, lens.fy, lens.cy),
+    ):
+        if not _LEAST_FOCAL * size <= focal_px <= _MOST_FOCAL * size:
+            raise ValueError(
+                f"f{axis} of images of {size} pixels must be {_LEAST_FOCAL * size:.3g} to "
+                f"{_MOST_FOCAL * size:.3g}, got {focal_px:g}"
+            )
+        if not -size <= centre_px <= 2 * size:
+            raise ValueError(
+                f"c{axis} of images of {size} pixels must be {-size} to {2 * size}, got {centre_px:g}"
+            )
+
+
 def check_calibration_file(values: Any, source: SourceSection, read_uri: str | None = None) -> None:
     """Check that `camera.calibration_file` in a table of sections is of the images of its source.
+
+    Not where its lens is there already: that of a recording, which is read without the file.
 
     Args:
         read_uri: a command's own source, which is read instead of `source.uri`.
@@ -272,23 +206,11 @@ def check_calibration_file(values: Any, source: SourceSection, read_uri: str | N
         ValueError: it is of another camera, or of images that are turned otherwise.
     """
     camera = values.get("camera") if isinstance(values, dict) else None
-    if isinstance(camera, dict) and isinstance(file := camera.get("calibration_file"), str):
+    if not isinstance(camera, dict) or camera.get("lens") is not None:
+        return
+    if isinstance(file := camera.get("calibration_file"), str):
         info = read_camera_info(expanded(file))
         info.check_source(source.opening().orientation, source.name, read_uri or source.uri)
-
-
-def lens_settings(lens: CameraModel) -> dict[str, Any]:
-    """Return the `camera` keys of a calibrated lens."""
-    return {
-        "fx_px": lens.fx,
-        "fy_px": lens.fy,
-        "cx_px": lens.cx,
-        "cy_px": lens.cy,
-        "calibrated_width": lens.width,
-        "calibrated_height": lens.height,
-        "distortion": lens.distortion,
-        "distortion_model": lens.distortion_model,
-    }
 
 
 class DetectorSection(Section):

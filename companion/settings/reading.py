@@ -29,6 +29,7 @@ from companion.settings.fields import (
     toml_value,
     value_from_text,
 )
+from companion.settings.former import LENS, REMOVED, RENAMED, VERSION, lens_line
 from companion.settings.section import Section
 from companion.settings.settings import Settings
 from companion.settings.toml_text import parse_toml
@@ -41,18 +42,6 @@ __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "l
 DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
 # COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. A section's name has no underscore.
 ENVIRONMENT_PREFIX = "COMPANION_"
-# Keys that were renamed in version 0.2.0; the old ones are errors that name the new ones.
-RENAMED = {
-    "camera.gimbal": "camera.on_gimbal",
-    "camera.mount_levelled": "camera.stabilized",
-    "detector.known_heights": "detector.class_heights_m",
-    "guidance.unknown_speed_mps": "guidance.max_speed_unobserved_mps",
-    "guidance.view": "guidance.camera",
-    "tracker.end_s": "tracker.max_age_s",
-    "tracker.lost_s": "tracker.coast_timeout_s",
-    "tracker.true_frames": "tracker.min_hits",
-    "tracker.true_score": "tracker.confirm_score",
-}
 
 
 class ConfigurationError(ValueError):
@@ -85,7 +74,7 @@ def flags() -> list[Flag]:
     return [
         Flag(f"{table}.{name}", plain_type(field), field.default, help_line(section, name))
         for table, section in sections_of_file().items()
-        for name, field in section.model_fields.items()
+        for name, field in section.fields_by_key().items()
     ]
 
 
@@ -144,11 +133,12 @@ def to_toml(settings: Settings) -> str:
 
 def _table(name: str, section: Section) -> str:
     lines = [f"# {(type(section).__doc__ or '').strip()}", f"[{name}]"]
-    for key in type(section).model_fields:
+    for key in type(section).fields_by_key():
         value = getattr(section, key)
         lines.append(f"# {help_line(type(section), key)}")
-        # TOML has no null: an unset key is a comment.
-        lines.append(f"# {key} =" if value is None else f"{key} = {toml_value(value)}")
+        # TOML has no null: an unset key is a comment; so is a field of view that a calibration replaces.
+        unset = value is None or (key == "horizontal_fov_deg" and getattr(section, "lens", None) is not None)
+        lines.append(f"# {key} =" if unset else f"{key} = {toml_value(value)}")
     return "\n".join(lines) + "\n"
 
 
@@ -164,6 +154,8 @@ class _Reading:
         self._values: dict[str, dict[str, Any]] = {}
         self._origins: dict[str, str] = {}
         self._problems: list[str] = []
+        # Table → former key of a lens → value and origin.
+        self._lenses: dict[str, dict[str, tuple[Any, str]]] = {}
 
     def take_file(self, path: Path) -> None:
         origin = f"in {path}"
@@ -175,10 +167,14 @@ class _Reading:
                 self._take_table(name, content, origin)
 
     def take_values(self, settings: Settings) -> None:
-        for name, content in settings.model_dump(exclude={"cameras"}).items():
-            self._take_table(name, content, "in effect")
-        for view, sections in settings.model_dump(include={"cameras"})["cameras"].items():
-            self._take_camera(view, sections, "in effect")
+        sections = {name: getattr(settings, name) for name in self._fields}
+        for camera, own in settings.cameras.items():
+            self._values[f"cameras.{camera}"] = {}
+            sections |= {f"cameras.{camera}.{name}": getattr(own, name) for name in SECTIONS_OF_CAMERA}
+        for table, section in sections.items():
+            # What is not a key too: `camera.lens`.
+            self._values[table] = {name: getattr(section, name) for name in section.model_fields_set}
+            self._origins |= {f"{table}.{name}": "in effect" for name in self._values[table]}
 
     def take_environment(self, environment: Mapping[str, str]) -> None:
         for variable in sorted(environment):
@@ -193,7 +189,7 @@ class _Reading:
         table, _, name = key.rpartition(".")
         field = self._field(table, name)
         if field is None:
-            self._problems.append(self._unknown(table, name, origin))
+            self._take_unknown(table, name, text, origin)
             return
         try:
             value = value_from_text(field, text)
@@ -203,6 +199,14 @@ class _Reading:
         self._take(table, name, value, origin)
 
     def settings(self, read_uri: str | None = None) -> Settings:
+        for table, lens in self._lenses.items():
+            keys = ", ".join(f"{table}.{name}" for name in lens)
+            origins = ", ".join(dict.fromkeys(origin for _, origin in lens.values()))
+            line = lens_line({name: value for name, (value, _) in lens.items()})
+            self._problems.append(
+                f"{keys} ({origins}) removed in version {VERSION}: write the line {line} to a file such as "
+                f'camera.yaml, and set {table}.calibration_file = "camera.yaml"'
+            )
         values: dict[str, Any] = {}
         for table, items in self._values.items():
             section = values
@@ -252,20 +256,26 @@ class _Reading:
     def _take(self, table: str, name: str, value: Any, origin: str) -> None:
         key = f"{table}.{name}"
         if self._field(table, name) is None:
-            self._problems.append(self._unknown(table, name, origin))
+            self._take_unknown(table, name, value, origin)
             return
         # TOML has arrays; the settings are frozen and hold tuples.
         self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value
         self._origins[key] = origin
 
-    def _unknown(self, table: str, name: str, origin: str) -> str:
-        key = f"{table}.{name}" if table else name
+    def _take_unknown(self, table: str, name: str, value: Any, origin: str) -> None:
         section = section_of(table) or table
+        if section == "camera" and name in LENS:
+            self._lenses.setdefault(table, {})[name] = value, origin
+            return
+        key = f"{table}.{name}" if table else name
         own = f"{section}.{name}" if section else name
         if now := RENAMED.get(own):
             now = f"{table}.{now.partition('.')[2]}"
-            return f"{key} ({origin}) was renamed to {now} in version 0.2.0"
-        return f"unknown key {key} ({origin}); {_nearest(own, self._keys)}"
+            self._problems.append(f"{key} ({origin}) was renamed to {now} in version {VERSION}")
+        elif removed := REMOVED.get(own):
+            self._problems.append(f"{key} ({origin}) was removed in version {VERSION}: {removed.instead}")
+        else:
+            self._problems.append(f"unknown key {key} ({origin}); {_nearest(own, self._keys)}")
 
     def _explain(self, details: ErrorDetails) -> str:
         parts = [str(part) for part in details["loc"]]

@@ -8,6 +8,10 @@ import inspect
 import sys
 
 from pydantic import BaseModel, ConfigDict
+from pydantic.fields import FieldInfo
+
+# In a field's annotation: the program sets it, no file, variable or flag does.
+NO_KEY = object()
 
 
 class Section(BaseModel):
@@ -17,6 +21,11 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    @classmethod
+    def fields_by_key(cls) -> dict[str, FieldInfo]:
+        """Return key → its field, in the order of the file."""
+        return {name: field for name, field in cls.model_fields.items() if NO_KEY not in field.metadata}
 
     @classmethod
     def help_texts(cls) -> dict[str, str]:

@@ -103,7 +103,7 @@ def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -
     assert all(f"view{number:02d}.png" in page for number in range(12))
     done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
     assert done.exit_code == 0, done.output
-    assert f"fx_px = {lens.fx}" in done.stdout
+    assert f'calibration_file = "{output}"' in done.stdout
 
 
 def test_result_names_where_the_lens_folds_the_image(few: Path) -> None:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from companion.cli.config_check import check_settings
 from companion.perception.cameras import WorkerCamera
 from companion.settings.reading import load_settings
+from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraCalibration, CameraModel
 
 FOLDED = CameraModel(640, 480, 300.0, 300.0, 320.0, 240.0, (0.1, -0.4, 0.0, 0.0), "equidistant")
@@ -32,11 +35,11 @@ def test_camera_that_brings_its_lens_warns(lens: CameraModel, warnings: int) -> 
     assert all("camera front" in text and "equidistant" in text for text in found)
 
 
-@pytest.mark.parametrize(("k2", "lines"), [("-0.4", 1), ("0.0", 0)])
-def test_settings_of_a_lens_are_checked(k2: str, lines: int, tmp_path: os.PathLike[str]) -> None:
-    lens = {"fx_px": "300", "fy_px": "300", "cx_px": "320", "cy_px": "240", "calibrated_width": "640"}
-    lens |= {"calibrated_height": "480", "distortion_model": "equidistant", "distortion": f"0.1,{k2},0,0"}
-    overrides = {f"camera.{key}": value for key, value in lens.items()}
+@pytest.mark.parametrize(("k2", "lines"), [(-0.4, 1), (0.0, 0)])
+def test_settings_of_a_lens_are_checked(k2: float, lines: int, tmp_path: Path) -> None:
+    file = tmp_path / "camera.yaml"
+    write_camera_info(file, replace(FOLDED, distortion=(0.1, k2, 0.0, 0.0)), "camera")
+    overrides = {"camera.calibration_file": str(file)}
     overrides |= {"source.uri": str(tmp_path), "detector.enabled": "false"}
     found = check_settings(load_settings(os.devnull, overrides, environment={}))
     assert len([line for line in found if line.startswith("camera: ")]) == lines

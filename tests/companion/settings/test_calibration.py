@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -59,10 +60,10 @@ def test_given_values_win_and_conflict_names_both() -> None:
 @pytest.mark.parametrize(
     ("lens", "mount", "key"),
     [
-        ((1e-3, 450.0, 320.0, 240.0), {}, "fx_px"),
-        ((450.0, 1e9, 320.0, 240.0), {}, "fy_px"),
-        ((450.0, 450.0, 1e12, 240.0), {}, "cx_px"),
-        ((450.0, 450.0, 320.0, -1e6), {}, "cy_px"),
+        ((1e-3, 450.0, 320.0, 240.0), {}, "fx"),
+        ((450.0, 1e9, 320.0, 240.0), {}, "fy"),
+        ((450.0, 450.0, 1e12, 240.0), {}, "cx"),
+        ((450.0, 450.0, 320.0, -1e6), {}, "cy"),
         ((450.0, 450.0, 320.0, 240.0), {"down_m": 1e30}, "mount_down_m"),
         ((450.0, 450.0, 320.0, 240.0), {"forward_m": math.nan}, "mount_forward_m"),
         ((450.0, 450.0, 320.0, 240.0), {"pitch_rad": 7.0}, "mount_pitch_deg"),
@@ -109,13 +110,15 @@ def test_angles_are_not_mixed_between_body_and_gimbal() -> None:
     assert agreed.mount_forward_m == 0.12
 
 
-def test_given_distortion_wins_alone() -> None:
-    lens = CameraModel(640, 480, 450.0, 450.0, 320.0, 239.0, (-0.1, 0.02, 0.0, 0.0))
+def test_given_calibration_wins_and_its_distortion_conflicts(tmp_path: Path) -> None:
+    own = CameraModel(640, 480, 450.0, 450.0, 320.0, 239.0, (-0.2, 0.02, 0.0, 0.0))
+    write_camera_info(file := tmp_path / "camera.yaml", own, "camera")
+    lens = replace(own, distortion=(-0.1, 0.02, 0.0, 0.0))
     camera, conflict = adopt_calibration(
-        section_of(distortion="-0.2, 0.02, 0, 0"), CameraCalibration(lens, MOUNT)
+        section_of(calibration_file=str(file)), CameraCalibration(lens, MOUNT)
     )
-    assert camera.fx_px == 450.0
-    assert camera.distortion == (-0.2, 0.02, 0.0, 0.0)
+    assert camera.model(640, 480).distortion == pytest.approx((-0.2, 0.02, 0.0, 0.0, 0.0))
+    assert conflict.startswith("distortion ")
     assert "-0.2" in conflict
     assert "-0.1" in conflict
 
@@ -139,9 +142,9 @@ def test_every_distortion_model_comes_with_the_camera(lens: CameraModel) -> None
 
 
 def test_other_distortion_model_is_a_conflict() -> None:
-    given = section_of(distortion_model="plumb_bob", distortion="0.1, 0, 0, 0")
+    given = section_of(horizontal_fov_deg="90")
     camera, conflict = adopt_calibration(given, CameraCalibration(FISHEYE))
-    assert camera.distortion_model == "plumb_bob"
+    assert camera.model(640, 480).distortion_model == "plumb_bob"
     assert "equidistant" in conflict
 
 
@@ -157,11 +160,11 @@ def test_calibration_file_gives_the_lens(tmp_path: Path, lens: CameraModel) -> N
     assert camera.mount_pitch_deg == -20.0
 
 
-def test_settings_of_a_calibration_file_are_its_numbers(tmp_path: Path) -> None:
+def test_printed_settings_name_the_calibration_file(tmp_path: Path) -> None:
     write_camera_info(file := tmp_path / "camera.yaml", FISHEYE, "front")
     settings = load_settings(os.devnull, {"camera.calibration_file": str(file)}, environment={})
+    # A field of view beside it is an error, so the one that is not given is a comment.
     (effective := tmp_path / "effective.toml").write_text(to_toml(settings))
-    file.unlink()
     assert load_settings(effective, {}, environment={}).camera == settings.camera
 
 
@@ -192,10 +195,14 @@ def test_calibration_of_the_same_images_is_used(tmp_path: Path) -> None:
     write_camera_info(file := tmp_path / "camera.yaml", LENS, "front", (), Orientation(180, True))
     values = {"source.rotate_deg": "180", "source.mirror": "true", "source.name": "front"}
     values["camera.calibration_file"] = str(file)
-    assert load_settings(os.devnull, values, environment={}).camera.fx_px == pytest.approx(LENS.fx)
+    assert load_settings(os.devnull, values, environment={}).camera.model(640, 480).fx == pytest.approx(
+        LENS.fx
+    )
     # A file of ROS does not say how its images were turned.
     write_camera_info(file, LENS, "camera")
-    assert load_settings(os.devnull, values, environment={}).camera.fx_px == pytest.approx(LENS.fx)
+    assert load_settings(os.devnull, values, environment={}).camera.model(640, 480).fx == pytest.approx(
+        LENS.fx
+    )
 
 
 def test_frames_of_another_aspect_are_refused(tmp_path: Path) -> None:
@@ -205,19 +212,12 @@ def test_frames_of_another_aspect_are_refused(tmp_path: Path) -> None:
         camera.model(1280, 720)
 
 
-@pytest.mark.parametrize("key", ["fx_px", "horizontal_fov_deg", "distortion"])
-def test_lens_given_twice_is_an_error(tmp_path: Path, key: str) -> None:
+def test_lens_given_twice_is_an_error(tmp_path: Path) -> None:
     write_camera_info(file := tmp_path / "camera.yaml", LENS, "front")
-    value = "0.1, 0, 0, 0" if key == "distortion" else "90"
-    with pytest.raises(ConfigurationError, match=rf"camera: calibration_file.*{key}"):
-        section_of(**{"calibration_file": str(file), key: value})
+    with pytest.raises(ConfigurationError, match=r"camera: calibration_file.*horizontal_fov_deg"):
+        section_of(calibration_file=str(file), horizontal_fov_deg="90")
 
 
 def test_missing_calibration_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"camera: .*none\.yaml"):
         section_of(calibration_file=str(tmp_path / "none.yaml"))
-
-
-def test_fisheye_needs_a_calibration() -> None:
-    with pytest.raises(ConfigurationError, match="equidistant"):
-        section_of(distortion_model="equidistant", distortion="0, 0, 0, 0")

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.settings.former import LENS, REMOVED, RENAMED, VERSION, without_removed
 from companion.settings.reading import (
-    RENAMED,
     ConfigurationError,
     Settings,
     changed,
@@ -20,6 +20,8 @@ from companion.settings.reading import (
     load_settings,
     to_toml,
 )
+from vision.calibration_files.camera_info import read_camera_info, write_camera_info
+from vision.camera_model import CameraModel
 from vision.detector import DEFAULT_MODEL
 
 REPOSITORY = Path(__file__).resolve().parents[3]
@@ -101,7 +103,6 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
             "detector.enabled": "off",
             "detector.threads": "none",
             "source.width": "640",
-            "camera.distortion": "0.1,-0.2,0,0",
             "zenoh.connect": "tcp/10.0.0.1:7447,udp/[::1]:7447",
         },
         {},
@@ -111,7 +112,6 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
     assert settings.detector.enabled is False
     assert settings.detector.threads is None
     assert settings.source.width == 640
-    assert settings.camera.distortion == (0.1, -0.2, 0.0, 0.0)
     assert settings.zenoh.connect == ("tcp/10.0.0.1:7447", "udp/[::1]:7447")
 
 
@@ -227,11 +227,7 @@ def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
             "guidance: min_altitude_m must be below max_altitude_m, got 60 and 50",
         ),
         ({"guidance.setpoint_lifetime_s": "0.04"}, "guidance: setpoint_lifetime_s must be longer than"),
-        ({"camera.fx_px": "500"}, "camera: a calibration needs all of fx_px, fy_px"),
-        (
-            {"camera.distortion": "1,2"},
-            "camera: distortion of plumb_bob must have 0, 4 or 5 coefficients, got 2",
-        ),
+        ({"camera.on_gimbal": "yes", "camera.stabilized": "yes"}, "camera: on_gimbal and stabilized"),
         ({"source.pixel_format": "bgr"}, "source: pixel_format"),
         ({"recording.video": "a.mp4"}, "recording: video must end in .webm, got 'a.mp4'"),
         ({"zenoh.mode": "client"}, "zenoh: a client needs an endpoint in connect"),
@@ -308,7 +304,7 @@ def test_printed_settings_round_trip(
         {
             "source": {"uri": uri, "loop": loop, "width": width},
             "detector": {"classes": tuple(classes), "confidence": confidence, "model": model},
-            "camera": {"distortion": (1e-7, -2.5, 1e17, 0.0)},
+            "camera": {"mount_forward_m": 1e-7, "mount_right_m": -2.5},
         }
     )
     text = to_toml(settings)
@@ -338,16 +334,8 @@ def test_field_of_view_spans_the_frame() -> None:
 
 
 def test_calibration_is_scaled_to_the_frame_size() -> None:
-    overrides = {
-        "camera.fx_px": "500",
-        "camera.fy_px": "510",
-        "camera.cx_px": "319.5",
-        "camera.cy_px": "239.5",
-        "camera.calibrated_width": "640",
-        "camera.calibrated_height": "480",
-        "camera.mount_pitch_deg": "-30",
-    }
-    camera = load_settings(REPOSITORY / "systemd/companion.toml", overrides, {}).camera
+    lens = CameraModel(640, 480, 500.0, 510.0, 319.5, 239.5)
+    camera = Settings.model_validate({"camera": {"lens": lens, "mount_pitch_deg": -30.0}}).camera
     assert (camera.model(640, 480).fx, camera.model(1280, 960).fx) == (500, 1000)
     assert camera.mount().pitch_rad == pytest.approx(-math.pi / 6)
     assert camera.field_rad == pytest.approx(2 * math.atan(320 / 500))
@@ -363,12 +351,101 @@ def test_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> No
     with pytest.raises(ConfigurationError) as failure:
         load_settings(path, {old: "1"}, {variable: "1"})
     renamed = [
-        line for line in failure.value.problems if line.endswith(f"was renamed to {new} in version 0.2.0")
+        line for line in failure.value.problems if line.endswith(f"renamed to {new} in version {VERSION}")
     ]
     assert [line.startswith(f"{old} (") for line in renamed] == [True] * 3
     assert any(variable in line for line in renamed)
     if section != "guidance":  # one camera steers; its section has no copy for each camera
         assert any(f"cameras.down.{new} in version" in line for line in failure.value.problems)
+
+
+@pytest.mark.parametrize("old", sorted(REMOVED.keys() - {f"camera.{name}" for name in LENS}))
+def test_removed_key_says_what_to_do_instead(old: str, tmp_path: Path) -> None:
+    section, _, name = old.partition(".")
+    path = tmp_path / "companion.toml"
+    path.write_text(f"[{section}]\n{name} = 1\n[cameras.down.{section}]\n{name} = 1\n")
+    variable = f"COMPANION_{section}_{name}".upper()
+    with pytest.raises(ConfigurationError) as failure:
+        load_settings(path, {old: "1"}, {variable: "1"})
+    removed = [line for line in failure.value.problems if line.startswith(f"{old} (")]
+    assert len(removed) == 3
+    assert all(line.endswith(f"in version {VERSION}: {REMOVED[old].instead}") for line in removed)
+    assert old not in {flag.key for flag in flags()}
+    assert REMOVED[old].instead
+
+
+LENS_TEXTS = {
+    "fx_px": "500.5",
+    "fy_px": "510",
+    "cx_px": "319.5",
+    "cy_px": "239.5",
+    "calibrated_width": "640",
+    "calibrated_height": "480",
+    "distortion": "0.1, -0.2, 0, 0",
+    "distortion_model": "equidistant",
+}
+LENS_MODEL = CameraModel(640, 480, 500.5, 510.0, 319.5, 239.5, (0.1, -0.2, 0.0, 0.0), "equidistant")
+
+
+def test_keys_of_a_lens_give_the_calibration_file(tmp_path: Path) -> None:
+    toml = [
+        f"{key} = '{text}'" if key == "distortion_model" else f"{key} = {text}"
+        for key, text in LENS_TEXTS.items()
+    ]
+    toml = [line.replace(LENS_TEXTS["distortion"], f"[{LENS_TEXTS['distortion']}]") for line in toml]
+    path = written(
+        tmp_path / "c.toml",
+        "\n".join(["[camera]", *toml, "[cameras.down.source]", "uri = 'a'", "[cameras.down.camera]", *toml]),
+    )
+    given = {f"COMPANION_CAMERA_{key}".upper(): text for key, text in LENS_TEXTS.items()}
+    assert LENS_TEXTS.keys() == LENS.keys()
+    in_file = problems(path)
+    assert [line.partition(",")[0] for line in in_file] == ["camera.fx_px", "cameras.down.camera.fx_px"]
+    for line in (
+        *in_file,
+        *problems(None, None, **given),
+        *problems(overrides={f"camera.{k}": v for k, v in LENS_TEXTS.items()}),
+    ):
+        assert "calibration_file" in line
+        content = line[line.index("{image_width") : line.rindex("}}") + 2]
+        written(tmp_path / "camera.yaml", content + "\n")
+        assert read_camera_info(tmp_path / "camera.yaml").model == LENS_MODEL
+    (alone,) = problems(overrides={"camera.fx_px": "500"})
+    assert "data: [500, 0, CX, 0, FY, CY, 0, 0, 1]" in alone
+
+
+def test_recorded_settings_are_read_without_removed_keys() -> None:
+    json_able = Settings.model_validate({"camera": {"mount_pitch_deg": -30.0}}).model_dump(mode="json")
+    for old, removed in REMOVED.items():
+        section, _, name = old.partition(".")
+        json_able[section][name] = removed.value
+    changed_keys: list[str] = []
+    read = Settings.from_json(without_removed(json_able, changed_keys))
+    assert (read.camera.mount_pitch_deg, read.camera.lens, changed_keys) == (-30.0, None, [])
+    old_lens: dict[str, object] = {
+        "fx_px": 500.5,
+        "fy_px": 510,
+        "cx_px": 319.5,
+        "cy_px": 239.5,
+        "calibrated_width": 640,
+    }
+    old_lens |= {"calibrated_height": 480, "distortion_model": "equidistant", "distortion": [0.1, -0.2, 0, 0]}
+    sections = {"camera": json_able["camera"] | old_lens}
+    read = Settings.from_json(
+        without_removed({**sections, "cameras": {"down": {**sections, "source": {"uri": "a"}}}}, changed_keys)
+    )
+    assert read.camera.lens == read.cameras["down"].camera.lens == LENS_MODEL
+    assert changed_keys == []
+
+
+def test_recorded_lens_is_read_without_its_file(tmp_path: Path) -> None:
+    file = written(tmp_path / "camera.yaml", "")
+    write_camera_info(file, LENS_MODEL, "camera")
+    settings = load_settings(os.devnull, {"camera.calibration_file": str(file)}, {})
+    file.unlink()
+    assert Settings.from_json(settings.model_dump(mode="json")) == settings
+    assert changed(settings, {"guidance.max_climb_mps": "1"}).camera == settings.camera
+    assert settings.camera.lens == LENS_MODEL
 
 
 def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:

@@ -1,0 +1,98 @@
+"""Keys of former versions: what they are called now, or what to do instead; settings in older recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+VERSION = "0.2.0"
+"""In which all of these were renamed or removed."""
+
+RENAMED = {
+    "camera.gimbal": "camera.on_gimbal",
+    "camera.mount_levelled": "camera.stabilized",
+    "detector.known_heights": "detector.class_heights_m",
+    "guidance.unknown_speed_mps": "guidance.max_speed_unobserved_mps",
+    "guidance.view": "guidance.camera",
+    "tracker.end_s": "tracker.max_age_s",
+    "tracker.lost_s": "tracker.coast_timeout_s",
+    "tracker.true_frames": "tracker.min_hits",
+    "tracker.true_score": "tracker.confirm_score",
+}
+"""Former key → key."""
+
+
+class Removed(NamedTuple):
+    """A key that was removed.
+
+    Attributes:
+        instead: what to do, in words.
+        value: what holds without it.
+    """
+
+    instead: str
+    value: Any = None
+
+
+_LENS_FILE = "write a calibration file, and set camera.calibration_file"
+LENS: dict[str, Any] = {
+    "fx_px": None,
+    "fy_px": None,
+    "cx_px": None,
+    "cy_px": None,
+    "calibrated_width": None,
+    "calibrated_height": None,
+    "distortion": [],
+    "distortion_model": "plumb_bob",
+}
+"""Former key of a lens in `camera` → its default. `lens_line` has what replaces them all."""
+
+REMOVED = {
+    **{f"camera.{name}": Removed(_LENS_FILE, value) for name, value in LENS.items()},
+}
+"""Former key → what to do instead."""
+
+
+def lens_line(values: Mapping[str, Any]) -> str:
+    """Return a calibration file of one line for former keys of a lens, with words for what is not given."""
+    given = {name: str(value) for name, value in values.items() if name in LENS}
+    fx, fy, cx, cy = (given.get(f"{name}_px", name.upper()) for name in ("fx", "fy", "cx", "cy"))
+    terms = given.get("distortion", "").strip("()[]").rstrip(",") or "0, 0, 0, 0, 0"
+    return (
+        f"{{image_width: {given.get('calibrated_width', 'WIDTH')}, "
+        f"image_height: {given.get('calibrated_height', 'HEIGHT')}, "
+        f"camera_matrix: {{data: [{fx}, 0, {cx}, 0, {fy}, {cy}, 0, 0, 1]}}, "
+        f"distortion_model: {given.get('distortion_model', 'plumb_bob')}, "
+        f"distortion_coefficients: {{data: [{terms}]}}}}"
+    )
+
+
+def without_removed(sections: Mapping[str, Any], changed: list[str], prefix: str = "") -> dict[str, Any]:
+    """Return recorded sections, JSON-able, without removed keys; those of a lens become `camera.lens`.
+
+    Args:
+        changed: gets a line for each removed key whose value was not what holds now.
+        prefix: of the keys in these lines: `cameras.NAME.`.
+    """
+    kept: dict[str, Any] = {}
+    for section, content in sections.items():
+        if section == "cameras":
+            names = {name: without_removed(own, changed, f"cameras.{name}.") for name, own in content.items()}
+            kept[section] = names
+            continue
+        kept[section] = _with_lens(content) if section == "camera" else dict(content)
+        for name, value in content.items():
+            removed = REMOVED.get(f"{section}.{name}")
+            if removed is not None and kept[section].pop(name, removed.value) != removed.value:
+                changed.append(f"recorded with {prefix}{section}.{name} = {value}: {removed.instead}")
+    return kept
+
+
+def _with_lens(camera: Mapping[str, Any]) -> dict[str, Any]:
+    if camera.get("fx_px") is None:
+        return dict(camera)
+    kept = {name: value for name, value in camera.items() if name not in LENS}
+    lens = {"width": camera["calibrated_width"], "height": camera["calibrated_height"]}
+    lens |= {name: camera[f"{name}_px"] for name in ("fx", "fy", "cx", "cy")}
+    lens |= {name: camera.get(name, LENS[name]) for name in ("distortion", "distortion_model")}
+    return kept | {"lens": lens}
