@@ -75,7 +75,6 @@ def test_example_bodies_in_the_document_are_valid() -> None:
         "tracks",
         "pose",
         "markers",
-        "camera_info",
         "velocity",
         "command_state",
     }
