@@ -111,7 +111,6 @@ class Autopilot:
         self._had_sticks = False
         self._last_setpoint_s = self._denied_sent_s = -math.inf
         self._setpoint_needs_position = False
-        self._rates_alone = False  # the newest offboard setpoint was of body rates
         self.navigator = Navigator(self, airframe, parameters, local_frame, on_event)
         # collision prevention: may reduce the sticks' setpoint in Position mode
         self.stick_guard: manual_flight.AccelerationGuard | None = self.navigator.guard_sticks
@@ -191,7 +190,7 @@ class Autopilot:
     def base_mode(self) -> int:
         # PX4 uses the newest setpoint, however old
         has_setpoint = math.isfinite(self._last_setpoint_s)
-        return base_mode(self.mode, self.armed, has_setpoint and not self._rates_alone)
+        return base_mode(self.mode, self.armed, has_setpoint)
 
     @property
     def landed_state(self) -> LandedState:
@@ -373,11 +372,10 @@ class Autopilot:
         """Restart the current mode's task."""
         self._start_task()
 
-    def offboard_setpoint(self, setpoint: flight.Setpoint) -> None:
+    def offboard_setpoint(self, setpoint: TrajectorySetpoint) -> None:
         """Use a valid setpoint. Outside OFFBOARD it only keeps the signal alive."""
         self._last_setpoint_s = self.now_s
         self._setpoint_needs_position = position_failsafe.asks_for_position(setpoint)
-        self._rates_alone = isinstance(setpoint, RatesSetpoint)
         if self.mode is Mode.OFFBOARD and isinstance(self.task, flight.Offboard):
             self.task.setpoint = setpoint
 
@@ -415,8 +413,8 @@ class Autopilot:
             self._idle(dt_s, 0.0)
         elif task.demand is not None:
             self._fly_directly(dt_s, task.demand)
-        elif not isinstance(setpoint, TrajectorySetpoint):
-            if isinstance(task, manual_flight.Acro) and self._spooling():
+        elif isinstance(setpoint, RatesSetpoint):
+            if self._spooling():
                 self._idle(dt_s, IDLE_THRUST_MPS2)
             else:
                 self.demand = self.attitude.fly(dt_s, setpoint, airframe, self.controller, self.demand)

@@ -10,7 +10,7 @@ back in the air, the intended mode is resumed; a vehicle that has descended to t
 
 from __future__ import annotations
 
-from mavlink_sim.flight.position_control import NAN, NOTHING, Demand, TrajectorySetpoint
+from mavlink_sim.flight.position_control import NAN, Demand, TrajectorySetpoint
 from mavlink_sim.flight.tasks import Land, Task
 from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.px4.modes import Mode
@@ -71,12 +71,9 @@ def needs_position(mode: Mode) -> bool:
     return mode not in WITHOUT_POSITION
 
 
-def asks_for_position(setpoint: object) -> bool:
-    """Whether an offboard setpoint needs the horizontal position or velocity (attitude setpoints do not)."""
-    for x, y, z in (getattr(setpoint, "position", NOTHING), getattr(setpoint, "velocity", NOTHING)):
-        if x == x or y == y or z == z:
-            return True
-    return False
+def asks_for_position(setpoint: TrajectorySetpoint) -> bool:
+    """Whether an offboard setpoint needs the position or velocity (an acceleration does not)."""
+    return any(x == x or y == y or z == z for x, y, z in (setpoint.position, setpoint.velocity))
 
 
 def landing_task(airframe: Multirotor, parameters: Parameters, *, position_valid: bool) -> Task:

@@ -1,4 +1,4 @@
-"""Control by attitude or by body rates: PX4's attitude controller and its ATTITUDE_TARGET.
+"""Control by body rates, of ACRO, and PX4's ATTITUDE_TARGET with the rates of its attitude controller.
 
 The control law is that of Brescianini, Hehn, D'Andrea, "Nonlinear Quadrocopter Attitude Control" (2013): the
 thrust direction is corrected first, the heading with a smaller weight (MC_YAW_WEIGHT). Thrust 0..1 is the
@@ -16,7 +16,6 @@ from mavlink_sim.physics.airframe import MAX_THRUST_MPS2, Multirotor
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
 from vision.attitude import (
-    IDENTITY,
     Quaternion,
     body_down_axis,
     quaternion_from_euler,
@@ -30,24 +29,8 @@ MAX_RATE_RADPS = math.radians(2000.0)  # the range of the gyroscopes; a setpoint
 
 
 @dataclass(frozen=True, slots=True)
-class AttitudeSetpoint:
-    """An attitude to hold.
-
-    Attributes:
-        quaternion: `ned_from_body` (w, x, y, z), of any length; one that is no rotation keeps the current
-            body rates, as PX4 makes no torque then.
-        yaw_rate_radps: feed-forward about the world's down axis; NaN for none.
-        thrust: collective, 0..1.
-    """
-
-    quaternion: Quaternion
-    yaw_rate_radps: float
-    thrust: float
-
-
-@dataclass(frozen=True, slots=True)
 class RatesSetpoint:
-    """Demanded body rates (FRD, rad/s); NaN: the rate at the time of the setpoint.
+    """Demanded body rates, FRD, rad/s; a rate that is not finite keeps the current one.
 
     `thrust`: collective, 0..1.
     """
@@ -66,14 +49,12 @@ class AttitudeTarget:
 
 
 class AttitudeController:
-    """The loop between an attitude setpoint and the airframe's body rates."""
+    """The loop of body rates, and what ATTITUDE_TARGET has."""
 
     def __init__(self, parameters: Parameters) -> None:
         self._parameters = parameters
         self._revision = -1
         self._target: AttitudeTarget | None = None
-        self._setpoint: AttitudeSetpoint | RatesSetpoint | None = None
-        self._rates: Vector = (0.0, 0.0, 0.0)
         self._load()
 
     def _load(self) -> None:
@@ -92,65 +73,56 @@ class AttitudeController:
 
     def release(self) -> None:
         """Another controller is active."""
-        if self._target is not None:
-            self._target = self._setpoint = None
+        self._target = None
 
     @property
     def active(self) -> bool:
-        """Attitude or rates are controlled, so there is no position target."""
+        """Rates are controlled, so there is no position target."""
         return self._target is not None
 
     def target(self, airframe: Multirotor, outer: PositionController, demand: Demand) -> AttitudeTarget:
         """For ATTITUDE_TARGET; `demand` is the output of the position controller `outer`, if that is active.
 
-        While rates are controlled, attitude and thrust stay those of the last attitude setpoint, as in PX4.
+        While rates are controlled, attitude and thrust stay the last demanded ones, as in PX4.
         """
         if self._target is not None:
             return self._target
         quaternion = quaternion_from_euler(demand.roll_rad, demand.pitch_rad, outer.yaw_rad)
         thrust = demand.thrust_mps2 / MAX_THRUST_MPS2
-        setpoint = AttitudeSetpoint(quaternion, outer.yaw_rate_radps, thrust)
-        return AttitudeTarget(quaternion, self.rates(setpoint, airframe), thrust)
+        return AttitudeTarget(quaternion, self.rates(quaternion, outer.yaw_rate_radps, airframe), thrust)
 
     def fly(
         self,
         dt_s: float,
-        setpoint: AttitudeSetpoint | RatesSetpoint,
+        setpoint: RatesSetpoint,
         airframe: Multirotor,
         outer: PositionController,
         demand: Demand,
     ) -> Demand:
         """One step of control and of the airframe. Returns the new demand; `demand` is the previous one."""
         before = self.target(airframe, outer, demand)
-        if isinstance(setpoint, AttitudeSetpoint):
-            demanded = self.rates(setpoint, airframe)
-            rates = _possible(demanded, airframe.rates)
-            self._target = AttitudeTarget(
-                unit_or_none(setpoint.quaternion) or IDENTITY, demanded, abs(setpoint.thrust)
-            )
-        else:
-            if setpoint is not self._setpoint:
-                self._rates = _possible(setpoint.rates, airframe.rates)
-            rates = self._rates
-            self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
-        self._setpoint = setpoint
+        rates = _possible(setpoint.rates, airframe.rates)
+        self._target = AttitudeTarget(before.quaternion, setpoint.rates, before.thrust)
         outer.reset(airframe.yaw_rad)  # so that it restarts with the current heading
         thrust_mps2 = min(max(setpoint.thrust, 0.0), 1.0) * MAX_THRUST_MPS2
         airframe.step_rates(dt_s, thrust_mps2, rates)
         return Demand(thrust_mps2, airframe.roll_rad, airframe.pitch_rad, airframe.rates[2])
 
-    def rates(self, setpoint: AttitudeSetpoint, airframe: Multirotor) -> Vector:
-        """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation."""
+    def rates(self, ned_from_body: Quaternion, yaw_rate_radps: float, airframe: Multirotor) -> Vector:
+        """The body rates (FRD, rad/s) that turn the airframe into an attitude; NaN if that is no rotation.
+
+        `yaw_rate_radps`: feed-forward about the world's down axis.
+        """
         if self._revision != self._parameters.revision:
             self._load()
-        wanted = unit_or_none(setpoint.quaternion)
+        wanted = unit_or_none(ned_from_body)
         if wanted is None:
             return (NAN, NAN, NAN)
         attitude = quaternion_from_euler(airframe.roll_rad, airframe.pitch_rad, airframe.yaw_rad)
         back = quaternion_inverse(attitude)
         w, x, y, z = quaternion_product(back, _weighted(attitude, wanted, self._yaw_weight))
         sign = 2.0 if w >= 0.0 else -2.0
-        feed_forward = setpoint.yaw_rate_radps if math.isfinite(setpoint.yaw_rate_radps) else 0.0
+        feed_forward = yaw_rate_radps if math.isfinite(yaw_rate_radps) else 0.0
         down_x, down_y, down_z = body_down_axis(back)
         gain_p, gain_q, gain_r = self._gains
         limit_p, limit_q, limit_r = self._limits

@@ -1,7 +1,7 @@
-"""The three offboard setpoint messages as PX4's MAVLink receiver reads them.
+"""The offboard setpoint messages as PX4's MAVLink receiver reads them.
 
-SET_POSITION_TARGET_LOCAL_NED, SET_POSITION_TARGET_GLOBAL_INT and SET_ATTITUDE_TARGET become the inputs of the
-controllers: `TrajectorySetpoint`, `AttitudeSetpoint`, `RatesSetpoint`.
+SET_POSITION_TARGET_LOCAL_NED and SET_POSITION_TARGET_GLOBAL_INT become the input of the controller, a
+`TrajectorySetpoint`. SET_ATTITUDE_TARGET is ignored.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
 from mavlink_sim.physics.rotations import Vector
@@ -27,14 +26,6 @@ ACCELERATION_IGNORE = (64, 128, 256)
 FORCE = 512
 YAW_IGNORE = 1024
 YAW_RATE_IGNORE = 2048
-
-# ATTITUDE_TARGET_TYPEMASK
-ROLL_RATE_IGNORE = 1
-PITCH_RATE_IGNORE = 2
-BODY_YAW_RATE_IGNORE = 4
-THRUST_BODY_SET = 32
-THROTTLE_IGNORE = 64
-ATTITUDE_IGNORE = 128
 
 
 class SetpointRejectedError(ValueError):
@@ -121,26 +112,6 @@ def global_trajectory_setpoint(
     return TrajectorySetpoint(position, velocity, acceleration, *_heading(message, mask))
 
 
-def attitude_setpoint(message: Any) -> AttitudeSetpoint | RatesSetpoint | None:
-    """The setpoint of a SET_ATTITUDE_TARGET message; None where neither attitude nor rates are given.
-
-    With both an attitude and rates the attitude is used, and the body yaw rate is its feed-forward. Rates
-    are used if neither the roll nor the pitch rate is ignored. An ignored throttle is zero thrust, as in PX4.
-    """
-    mask = int(message.type_mask)
-    yaw_rate = NAN if mask & BODY_YAW_RATE_IGNORE else float(message.body_yaw_rate)
-    thrust = 0.0 if mask & THROTTLE_IGNORE else _number(message.thrust)
-    if not mask & ATTITUDE_IGNORE:
-        if mask & THRUST_BODY_SET:
-            # pymavlink's dialects of 2.4.50 have no thrust_body; then the vector is zero
-            thrust = -_number(getattr(message, "thrust_body", (0.0, 0.0, 0.0))[2])
-        w, x, y, z = (float(value) for value in message.q)
-        return AttitudeSetpoint((w, x, y, z), yaw_rate, thrust)
-    if mask & (ROLL_RATE_IGNORE | PITCH_RATE_IGNORE):
-        return None
-    return RatesSetpoint((float(message.body_roll_rate), float(message.body_pitch_rate), yaw_rate), thrust)
-
-
 def flyable(setpoint: TrajectorySetpoint) -> TrajectorySetpoint:
     """The setpoint itself, or "stop and wait" where PX4's position controller cannot follow it.
 
@@ -162,17 +133,17 @@ def flyable(setpoint: TrajectorySetpoint) -> TrajectorySetpoint:
 def _heading(message: Any, mask: int) -> tuple[float, float]:
     """(yaw, yaw rate) of either position target message."""
     return (
-        NAN if mask & YAW_IGNORE else _number(message.yaw, NAN),
-        NAN if mask & YAW_RATE_IGNORE else _number(message.yaw_rate, NAN),
+        NAN if mask & YAW_IGNORE else _number(message.yaw),
+        NAN if mask & YAW_RATE_IGNORE else _number(message.yaw_rate),
     )
 
 
-def _number(value: float, otherwise: float = 0.0) -> float:
-    return float(value) if math.isfinite(value) else otherwise
+def _number(value: float) -> float:
+    return float(value) if math.isfinite(value) else NAN
 
 
 def _finite(values: Vector) -> Vector:
-    x, y, z = (_number(value, NAN) for value in values)
+    x, y, z = (_number(value) for value in values)
     return (x, y, z)
 
 
@@ -186,9 +157,9 @@ def _kept(values: Vector, mask: int, bits: tuple[int, int, int]) -> Vector:
     if mask & bit_x and mask & bit_y and mask & bit_z:
         return NOTHING
     return (
-        NAN if mask & bit_x else _number(x, NAN),
-        NAN if mask & bit_y else _number(y, NAN),
-        NAN if mask & bit_z else _number(z, NAN),
+        NAN if mask & bit_x else _number(x),
+        NAN if mask & bit_y else _number(y),
+        NAN if mask & bit_z else _number(z),
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 
-from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
+from mavlink_sim.flight.attitude_control import RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, Demand, TrajectorySetpoint
 from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.rotations import Vector
@@ -23,7 +23,7 @@ YAW_FIXED = 5
 MIN_COURSE_SPEED_MPS = 0.5  # below this speed the direction of flight is undefined
 
 
-Setpoint = TrajectorySetpoint | AttitudeSetpoint | RatesSetpoint
+Setpoint = TrajectorySetpoint | RatesSetpoint
 
 # Share of the acceleration limit that the planned braking uses, so that the vehicle can follow it.
 BRAKING_SHARE = 0.6
@@ -295,9 +295,9 @@ class Offboard(Task):
     """Follow the newest setpoint; before the first one in this mode, stay at rest."""
 
     def __init__(self) -> None:
-        self.setpoint: Setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
+        self.setpoint = TrajectorySetpoint(velocity=(0.0, 0.0, 0.0))
 
-    def update(self, dt_s: float) -> Setpoint:
+    def update(self, dt_s: float) -> TrajectorySetpoint:
         return self.setpoint
 
 

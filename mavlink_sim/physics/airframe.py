@@ -211,13 +211,9 @@ class Multirotor:
         self._rate_demand = None
 
     def command_rates(self, thrust_mps2: float, rates_radps: Vector) -> None:
-        """Set the demand: collective thrust and body rates; NaN: keep the rate demanded before."""
+        """Set the demand: collective thrust and body rates."""
         self._thrust_demand_mps2 = thrust_mps2
-        before = self._rate_demand or self.rates
-        p, q, r = (
-            asked if math.isnan(rate) else rate for rate, asked in zip(rates_radps, before, strict=True)
-        )
-        self._rate_demand = (p, q, r)
+        self._rate_demand = rates_radps
 
     def fail_motor(self, index: int, effectiveness: float = 0.0) -> None:
         """Reduce a rotor (0 to 3) to this share of its command; 1 restores it.

@@ -9,7 +9,6 @@ from typing import Any
 from mavlink_sim.autopilot.commander import ACCEPTED
 from mavlink_sim.flight.setpoints import (
     SetpointRejectedError,
-    attitude_setpoint,
     flyable,
     global_trajectory_setpoint,
     trajectory_setpoint,
@@ -111,12 +110,6 @@ def _global_setpoint(vehicle: ServiceContext, link: Link, message: Any) -> None:
         autopilot.offboard_setpoint(flyable(setpoint))
 
 
-def _attitude_setpoint(vehicle: ServiceContext, link: Link, message: Any) -> None:
-    setpoint = attitude_setpoint(message)
-    if setpoint is not None:
-        vehicle.autopilot.offboard_setpoint(setpoint)
-
-
 def _timesync(vehicle: ServiceContext, link: Link, message: Any) -> None:
     if message.tc1 == 0:
         link.send(dialect.MAVLink_timesync_message(vehicle.clock_ns(), message.ts1))
@@ -155,7 +148,6 @@ HANDLERS: dict[str, Handler] = {
     "SET_MODE": _set_mode,
     "SET_POSITION_TARGET_LOCAL_NED": _setpoint,
     "SET_POSITION_TARGET_GLOBAL_INT": _global_setpoint,
-    "SET_ATTITUDE_TARGET": _attitude_setpoint,
     "MANUAL_CONTROL": manual_control_service.manual_control,
     "RC_CHANNELS_OVERRIDE": manual_control_service.rc_channels_override,
     "GIMBAL_MANAGER_SET_ATTITUDE": gimbal_protocol.set_attitude,

@@ -212,19 +212,6 @@ def test_global_relative_position_is_reached(flying: LockstepVehicle) -> None:
     assert away(flying, (10.0, 0.0, -9.0)) < 1.0
 
 
-def test_attitude_with_climb_rate_levels_after_timeout(flying: LockstepVehicle) -> None:
-    tilt = math.radians(-8.0)
-    attitude = dialect.MAVLink_set_attitude_target_message(
-        0, 1, 1, 0b111, [math.cos(tilt / 2), 0.0, math.sin(tilt / 2), 0.0], 0.0, 0.0, 0.0, 0.75
-    )
-    flying.send(attitude)
-    flying.step(2.5)
-    assert flying.truth.pitch_rad == pytest.approx(tilt, abs=0.05)
-    assert flying.truth.velocity_ned_mps[2] == pytest.approx(-1.05, abs=0.4)  # drag takes some
-    flying.step(2.0)
-    assert flying.truth.pitch_rad == pytest.approx(0.0, abs=0.05)
-
-
 def test_setpoints_ignored_outside_guided(flying: LockstepVehicle) -> None:
     flying.set_mode("BRAKE")
     flying.step(2.0)

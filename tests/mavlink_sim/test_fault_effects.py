@@ -212,13 +212,12 @@ def test_gps_loss_in_offboard_without_sticks_sinks(
     assert (harness.height_m < 4.0) is sinks
 
 
-def test_offboard_by_attitude_needs_no_position() -> None:
+def test_offboard_by_acceleration_needs_no_position() -> None:
     from mavlink_sim.autopilot.position_failsafe import asks_for_position
     from mavlink_sim.flight.position_control import TrajectorySetpoint
 
     assert asks_for_position(TrajectorySetpoint(velocity=(1.0, 0.0, 0.0)))
     assert not asks_for_position(TrajectorySetpoint(acceleration=(0.0, 0.0, 0.0)))
-    assert not asks_for_position(object())
 
 
 def test_hold_without_gps_descends_and_pilot_gets_altitude_mode(harness: SimHarness) -> None:

@@ -1,6 +1,6 @@
 """GUIDED: take-off and the newest target; a target without position stops the vehicle after GUID_TIMEOUT.
 
-A position is flown to and held without a timeout. A velocity, an acceleration or an attitude that is older
+A position is flown to and held without a timeout. A velocity or an acceleration that is older
 than GUID_TIMEOUT seconds becomes zero, and the vehicle stops; it stays in GUIDED. Paused (DO_PAUSE_CONTINUE)
 it stops too, whatever new targets arrive.
 """
@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from mavlink_sim.flight import tasks as flight
-from mavlink_sim.flight.attitude_control import AttitudeSetpoint, RatesSetpoint
 from mavlink_sim.flight.position_control import NAN, NOTHING, TrajectorySetpoint
 from mavlink_sim.flight.setpoints import (
     ACCELERATION_IGNORE,
@@ -28,11 +27,10 @@ from mavlink_sim.flight.setpoints import (
     YAW_IGNORE,
     YAW_RATE_IGNORE,
 )
-from mavlink_sim.physics.airframe import GRAVITY_MPS2, LINEAR_DRAG_PER_S, MAX_THRUST_MPS2, Multirotor
+from mavlink_sim.physics.airframe import LINEAR_DRAG_PER_S, Multirotor
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M, LocalFrame
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.parameters import Parameters
-from vision.attitude import Quaternion, quaternion_from_euler
 
 LOCAL_OFFSET_NED = 7  # MAV_FRAME_LOCAL_OFFSET_NED
 BODY_OFFSET_NED = 9  # MAV_FRAME_BODY_OFFSET_NED
@@ -135,9 +133,7 @@ VELOCITY_LAG_S = 0.4
 CLIMB_LEAD_S = 0.35
 LEAST_GAIN_MPS2 = 0.1
 TAKEOFF_DONE_M = 0.06  # a take-off is complete within this distance of its height
-CLIMB_GAIN_PER_S = 4.0
 FACING_SPEED_MPS = 1.0  # above this speed the direction of flight is defined
-THRUST_AS_THRUST = 8  # GUID_OPTIONS: SET_ATTITUDE_TARGET's thrust is a thrust, not a climb rate
 ZERO: Vector = (0.0, 0.0, 0.0)
 
 
@@ -177,15 +173,6 @@ class Heading:
         return self.yaw_rad
 
 
-class Attitude:
-    """An attitude or body rates with a climb rate (m/s, up) or a thrust (0..1)."""
-
-    def __init__(
-        self, quaternion: Quaternion | None, rates: Vector | None, climb_mps: float, thrust: float = NAN
-    ) -> None:
-        self.quaternion, self.rates, self.climb_mps, self.thrust = quaternion, rates, climb_mps, thrust
-
-
 class Takeoff(flight.Takeoff):
     """Climb vertically, accelerating and braking by WPNAV_ACCEL_Z, up to WPNAV_SPEED_UP."""
 
@@ -223,7 +210,6 @@ class Guided(flight.Task):
         self._followed = self._trajectory.velocity
         self._takeoff: Takeoff | None = None
         self._reached = False  # the height of the take-off
-        self._attitude: Attitude | None = None
         self._target = STOP
         self._age_s = 0.0
         self.heading = Heading(parameters, airframe.yaw_rad)
@@ -241,26 +227,21 @@ class Guided(flight.Task):
     def fly(self, target: GuidedTarget) -> None:
         """Set a new target; it replaces the current one."""
         same_kind = self._kind(target) == self._kind(self._target)
-        if self._takeoff is not None or self._attitude is not None or not same_kind:
+        if self._takeoff is not None or not same_kind:
             self._begin()
         self._target, self._age_s = target, 0.0
         self.goal = target.position
         self.heading.take(target.yaw_rad, target.yaw_rate_radps)
 
-    def fly_attitude(self, attitude: Attitude) -> None:
-        if self._attitude is None:
-            self._begin()
-        self._attitude, self._age_s, self.goal = attitude, 0.0, None
-
     def cruise_at(self, speed_mps: float) -> None:
         self._trajectory.cruise_mps = speed_mps
 
     @property
-    def target(self) -> GuidedTarget | None:
-        """The target for POSITION_TARGET_LOCAL_NED; None while an attitude is controlled."""
+    def target(self) -> GuidedTarget:
+        """The target for POSITION_TARGET_LOCAL_NED."""
         if self._takeoff is not None:
             return GuidedTarget(position=self._takeoff.goal)
-        return None if self._attitude is not None else self._target
+        return self._target
 
     @property
     def starting(self) -> bool:
@@ -288,17 +269,15 @@ class Guided(flight.Task):
         self._trajectory = flight.Trajectory(self._airframe, self._parameters)
         self._trajectory.cruise_mps = cruise
         self._followed = self._trajectory.velocity
-        self._takeoff = self._attitude = None
+        self._takeoff = None
         self._target = STOP
         self.heading.yaw_rad = self._airframe.yaw_rad
 
     # ---- one step ---------------------------------------------------------------------------------------
 
-    def update(self, dt_s: float) -> flight.Setpoint:
+    def update(self, dt_s: float) -> TrajectorySetpoint:
         self._age_s += dt_s
         stale = self._age_s > self._parameters.number("GUID_TIMEOUT")
-        if self._attitude is not None:
-            return self._by_attitude(self._attitude, stale or self.paused)
         if self._takeoff is not None and not self.paused:
             setpoint = self._takeoff.update(dt_s)
         elif self.paused:
@@ -354,22 +333,6 @@ class Guided(flight.Task):
         )
         trajectory.position = (x, y, z)
         return TrajectorySetpoint((x, y, z), self._followed, _feed_forward(before, velocity, dt_s))
-
-    def _by_attitude(self, attitude: Attitude, stale: bool) -> AttitudeSetpoint | RatesSetpoint:
-        frame = self._airframe
-        self._trajectory.velocity = frame.velocity
-        climb, thrust = attitude.climb_mps, attitude.thrust
-        if stale:
-            attitude = Attitude(quaternion_from_euler(0.0, 0.0, frame.yaw_rad), None, 0.0)
-            climb, thrust = 0.0, NAN
-        if math.isnan(thrust):
-            upright = max(math.cos(frame.roll_rad) * math.cos(frame.pitch_rad), 0.3)
-            lift = GRAVITY_MPS2 + CLIMB_GAIN_PER_S * (climb + frame.velocity[2])
-            thrust = min(max(lift / upright / MAX_THRUST_MPS2, 0.06), 1.0)
-        if attitude.quaternion is None:
-            return RatesSetpoint(attitude.rates or ZERO, thrust)
-        rate = NAN if attitude.rates is None else attitude.rates[2]
-        return AttitudeSetpoint(attitude.quaternion, rate, thrust)
 
 
 def _feed_forward(before: Vector, velocity: Vector, dt_s: float) -> Vector:

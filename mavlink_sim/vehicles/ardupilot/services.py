@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from mavlink_sim.flight.precision_landing import LandingTarget
-from mavlink_sim.flight.setpoints import (
-    ATTITUDE_IGNORE,
-    BODY_YAW_RATE_IGNORE,
-    PITCH_RATE_IGNORE,
-    ROLL_RATE_IGNORE,
-    THROTTLE_IGNORE,
-)
 from mavlink_sim.px4.parameters import Parameter
 from mavlink_sim.services import manual_control_service, microservices
 from mavlink_sim.services.parameter_protocol import text_of
 from mavlink_sim.vehicles.ardupilot import commands, landing, streams
 from mavlink_sim.vehicles.ardupilot.context import CopterContext
 from mavlink_sim.vehicles.ardupilot.guided import (
-    STOP,
-    THRUST_AS_THRUST,
-    Attitude,
     global_target,
     local_target,
 )
@@ -83,9 +72,7 @@ def _send_value(vehicle: CopterContext, link: Link, parameter: Parameter, index:
     )
 
 
-RATES_IGNORE = ROLL_RATE_IGNORE | PITCH_RATE_IGNORE | BODY_YAW_RATE_IGNORE
 MISSION_UNSUPPORTED = 3  # MAV_MISSION_UNSUPPORTED
-UNIT_TOLERANCE = 1e-3
 
 
 def _heartbeat(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -105,38 +92,6 @@ def _global_target(vehicle: CopterContext, link: Link, message: Any) -> None:
     guided = vehicle.copter.guided
     if guided is not None:
         guided.fly(global_target(message, vehicle.local_frame, vehicle.copter.home.position))
-
-
-def _attitude_target(vehicle: CopterContext, link: Link, message: Any) -> None:
-    """Attitude, all three body rates, or both, and a thrust; any other combination stops the vehicle."""
-    guided = vehicle.copter.guided
-    if guided is None:
-        return
-    mask = int(message.type_mask)
-    ignored = mask & RATES_IGNORE
-    quaternion = None
-    if not mask & ATTITUDE_IGNORE:
-        w, x, y, z = (float(value) for value in message.q)
-        quaternion = (w, x, y, z)
-    rates = (message.body_roll_rate, message.body_pitch_rate, message.body_yaw_rate)
-    sound = (
-        not mask & THROTTLE_IGNORE
-        and ignored in (0, RATES_IGNORE)
-        and math.isfinite(message.thrust)
-        and all(math.isfinite(rate) for rate in rates)
-        and (quaternion is None or abs(math.hypot(*quaternion) - 1.0) < UNIT_TOLERANCE)
-    )
-    if not sound:
-        guided.fly(STOP)
-        return
-    given = None if ignored else rates
-    if int(vehicle.parameters.number("GUID_OPTIONS")) & THRUST_AS_THRUST:
-        guided.fly_attitude(Attitude(quaternion, given, 0.0, min(max(message.thrust, 0.0), 1.0)))
-        return
-    share = (min(max(message.thrust, 0.0), 1.0) - 0.5) * 2.0
-    name = "WPNAV_SPEED_UP" if share > 0.0 else "WPNAV_SPEED_DN"
-    climb = share * vehicle.parameters.number(name) / 100.0
-    guided.fly_attitude(Attitude(quaternion, given, climb))
 
 
 def _landing_target(vehicle: CopterContext, link: Link, message: Any) -> None:
@@ -183,7 +138,6 @@ HANDLERS: dict[str, Handler] = {
     "SET_MODE": commands.set_mode,
     "SET_POSITION_TARGET_LOCAL_NED": _local_target,
     "SET_POSITION_TARGET_GLOBAL_INT": _global_target,
-    "SET_ATTITUDE_TARGET": _attitude_target,
     "MANUAL_CONTROL": manual_control_service.manual_control,
     "RC_CHANNELS_OVERRIDE": manual_control_service.rc_channels_override,
     "TIMESYNC": microservices.HANDLERS["TIMESYNC"],

@@ -63,11 +63,11 @@ def _home_position(vehicle: CopterContext) -> Any:
 
 
 def _position_target_local_ned(vehicle: CopterContext) -> Any:
-    """The target of GUIDED; None in other modes and while an attitude is controlled."""
+    """The target of GUIDED; None in other modes."""
     guided = vehicle.copter.guided
-    target = None if guided is None else guided.target
-    if target is None:
+    if guided is None:
         return None
+    target = guided.target
     mask = IGNORE_YAWS
     mask |= IGNORE_POSITION if target.position is None else 0
     mask |= IGNORE_VELOCITY if target.velocity is None else 0
