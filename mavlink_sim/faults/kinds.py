@@ -1,4 +1,4 @@
-"""All kinds of faults: their grammar, and the function of the same name in `effects` that begins each.
+"""All kinds of faults: their grammar, and the function that begins each: of the same name, in a `*_effects`.
 
 The function gets the vehicle and the `ActiveFault`, and appends to `undo` what restores the state; effects
 that depend on time go into `each_step`. docs/faults.md compares each with reality.
@@ -6,9 +6,10 @@ that depend on time go into `each_step`. docs/faults.md compares each with reali
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Callable
 
-from mavlink_sim.faults import effects
+from mavlink_sim.faults import link_effects, message_effects, vehicle_effects
 from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import REQUIRED, Field, Kind, choice, number, positive, probability, whole
 from mavlink_sim.px4.modes import Mode
@@ -17,7 +18,7 @@ Effect = Callable[[FaultTarget, ActiveFault], None]
 
 
 def _battery(text: str) -> float | str:
-    if text.lower() in effects.CHARGE_OF_WARNING:
+    if text.lower() in vehicle_effects.CHARGE_OF_WARNING:
         return text.lower()
     try:
         return number(0.0, 1.0)(text)
@@ -194,4 +195,5 @@ _TABLE: tuple[Kind, ...] = (
 )
 
 KINDS: dict[str, Kind] = {kind.name: kind for kind in _TABLE}
-EFFECTS: dict[str, Effect] = {name: getattr(effects, name) for name in KINDS}
+_FUNCTIONS = ChainMap(vars(link_effects), vars(message_effects), vars(vehicle_effects))
+EFFECTS: dict[str, Effect] = {name: _FUNCTIONS[name] for name in KINDS}

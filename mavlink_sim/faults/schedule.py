@@ -23,9 +23,10 @@ from typing import Any
 
 from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.context import ActiveFault, CommandCheck, FaultTarget, Gate
-from mavlink_sim.faults.effects import chosen_links, shifted
 from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
+from mavlink_sim.faults.link_effects import chosen_links
+from mavlink_sim.faults.message_effects import shifted
 from mavlink_sim.physics.estimate_errors import as_reported
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.wire.link_faults import LinkStage
