@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Protocol
@@ -155,7 +155,9 @@ class SimulatedDriver:
             for number, rate_hz in self._profile.rates_hz.items():
                 self.vehicle.send(self._long(dialect.MAV_CMD_SET_MESSAGE_INTERVAL, number, 1e6 / rate_hz))
             self.vehicle.step(COPTER_STREAMS_S)
-        self.receive()
+        # What it sent before this driver came, a take-off perhaps: the newest of each kind is its state.
+        self.vehicle.receive()
+        self._read(next(iter(self.vehicle.newest.values())).values())
 
     @property
     def now_ns(self) -> int:
@@ -259,8 +261,11 @@ class SimulatedDriver:
 
     def receive(self) -> None:
         """Messages into the state, acknowledgements into answers."""
+        self._read(self.vehicle.receive())
+
+    def _read(self, messages: Iterable[Any]) -> None:
         now_ns = self.now_ns
-        for message in self.vehicle.receive():
+        for message in messages:
             name = message.get_type()
             if name == "COMMAND_ACK":
                 self._acknowledge(message)

@@ -129,6 +129,7 @@ def new_vehicle(autopilot: str) -> LockstepVehicle:
 def parked(autopilot: str) -> LockstepVehicle:
     vehicle = new_vehicle(autopilot)
     vehicle.step(8.0)
+    vehicle.receive()
     return vehicle
 
 
@@ -136,6 +137,7 @@ def parked(autopilot: str) -> LockstepVehicle:
 def airborne(autopilot: str) -> LockstepVehicle:
     vehicle = new_vehicle(autopilot)
     vehicle.take_off(6.0, limit_s=90.0)
+    vehicle.receive()
     return vehicle
 
 
