@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,17 +14,13 @@ from vision.depth import DepthSummary, depth_summary
 from vision.detections import Detections
 from vision.frame import Frame
 from vision.frame_changes import FrameChanges
-from vision.frame_selection import TOO_OLD, FrameSelector, Selection
+from vision.frame_selection import FrameSelector
 from vision.marker_boards import BoardPose
 from vision.markers import Marker
 from vision.object_detector import Timing
 from vision.obstacle_sectors import ObstacleSectors
 from vision.sources import Source
 from vision.tracking import CameraView, ObjectSelection, Tracker, TrackEvent
-
-logger = logging.getLogger(__name__)
-
-_WARN_INTERVAL_NS = 10_000_000_000
 
 SurfacesIn = Callable[[Frame, NDArray[np.float32]], tuple[NDArray[np.float32], NDArray[np.float32]]]
 
@@ -46,7 +41,7 @@ class PerceptionResult:
             `total`: from reading the frame to here.
         dropped: frames lost so far between the source and here; frames skipped on purpose do not count.
         frames_skipped: reason → frames so far that were not processed. `replaced` by a newer one,
-            `unreadable`, `too_old`; and on purpose `every` and `rate`.
+            `unreadable`; and on purpose `rate`.
         track_events: oldest first; all since the previous result.
         markers: those in the frame; None if marker detection is off.
         obstacles: distance of the nearest one in each direction; None without depth or attitude.
@@ -130,7 +125,7 @@ class Pipeline:
         source: Source,
         detector: FrameDetector | None,
         *,
-        selection: Selection = Selection(),  # noqa: B008 - frozen
+        max_rate_hz: float | None = None,
         recorder: FrameRecorder | None = None,
         tracker: Tracker | None = None,
         view_at: Callable[[Frame], CameraView | None] = lambda _: None,
@@ -143,7 +138,7 @@ class Pipeline:
         Args:
             source: open; the caller closes it.
             detector: None: no detection, every result is empty.
-            selection: which frames are processed. The others are only recorded.
+            max_rate_hz: of the frames that are processed; None: all. The others are only recorded.
             recorder: receives every frame with the newest detections, after the result is delivered.
             tracker: receives the detections of every processed frame.
             view_at: returns the camera orientation at a frame's capture, None if unknown. Called after the
@@ -156,7 +151,7 @@ class Pipeline:
         """
         self._source = source
         self._detector = detector
-        self._selector = FrameSelector(selection)
+        self._selector = FrameSelector(max_rate_hz)
         self._changes = FrameChanges()
         self._recorder = recorder
         self._tracker = tracker if detector is not None else None
@@ -172,7 +167,6 @@ class Pipeline:
         self._next_sequence = 0
         self._missing = 0
         self._replaced = 0
-        self._next_warning_ns = 0
         self.frames = 0
 
     @property
@@ -181,7 +175,7 @@ class Pipeline:
         unreadable = self._source.statistics.unreadable
         # The source counts an unreadable frame before the gap it leaves; the count must not decrease.
         self._replaced = max(self._replaced, self._missing - unreadable)
-        return {"replaced": self._replaced, "unreadable": unreadable, **self._selector.frames_skipped}
+        return {"replaced": self._replaced, "unreadable": unreadable, "rate": self._selector.skipped}
 
     @property
     def frames_repeated(self) -> dict[str, int]:
@@ -191,7 +185,7 @@ class Pipeline:
     @property
     def dropped(self) -> int:
         """Frames lost so far between the source and here; frames skipped on purpose do not count."""
-        return self._missing + self._selector.frames_skipped[TOO_OLD]
+        return self._missing
 
     def step(self, timeout_s: float, deliver: Callable[[PerceptionResult], None]) -> bool:
         """Read one frame, process it if selected, pass the result to `deliver`, then record the frame.
@@ -210,23 +204,13 @@ class Pipeline:
         self._missing += max(0, frame.sequence - self._next_sequence)
         self._next_sequence = frame.sequence + 1
         self.frames += 1
-        too_old = self._selector.frames_skipped[TOO_OLD]
-        if self._selector.accept(frame, picked_ns):
+        if self._selector.accept(frame):
             result = self._process(frame, picked_ns)
             self._newest = result.detections
             deliver(result)
-        if self._selector.frames_skipped[TOO_OLD] > too_old:
-            self._log_too_old((picked_ns - frame.captured_ns) / 1e9, picked_ns)
         if self._recorder is not None:
             self._recorder.write(frame, self._newest)
         return True
-
-    def _log_too_old(self, age_s: float, now_ns: int) -> None:
-        if now_ns >= self._next_warning_ns:
-            self._next_warning_ns = now_ns + _WARN_INTERVAL_NS
-            logger.warning(
-                "%s: frame age is %.2f s on arrival, above max_age_s; skipped", self._source.uri, age_s
-            )
 
     def _process(self, frame: Frame, picked_ns: int) -> PerceptionResult:
         started_ns = time.perf_counter_ns()

@@ -43,7 +43,6 @@ SHORT_NAMES = {
     "detector.model": "--model",
     "detector.classes": "--classes",
     "detector.confidence": "--confidence",
-    "detector.every": "--every",
     "vehicle.driver": "--driver",
     "recording.video": "--video",
     "log.level": "--log-level",

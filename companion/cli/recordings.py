@@ -17,10 +17,7 @@ if TYPE_CHECKING:
     from companion.settings import Settings
 
 EXIT_DIFFERENT = 1
-RECORD_SETTINGS = tuple(
-    f"recording.{key}"
-    for key in ("images", "depth", "clouds", "max_file_mb", "max_file_minutes", "max_total_mb")
-)
+RECORD_SETTINGS = tuple(f"recording.{key}" for key in ("content", "max_file_mb", "max_total_mb"))
 
 log = typer.Typer(
     help="List and show recordings.",
@@ -52,10 +49,9 @@ def record(
             vehicle=settings.vehicle.name,
             directory=str(directory),
             images=recording.images,
-            depth=recording.depth,
-            clouds=recording.clouds,
+            depth="depth" in recording.content,
+            clouds="clouds" in recording.content,
             max_file_mb=recording.max_file_mb,
-            max_file_minutes=recording.max_file_minutes,
             max_total_mb=recording.max_total_mb,
         )
         record_until(options, ending, lambda text: typer.echo(text, err=True))

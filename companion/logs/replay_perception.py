@@ -348,7 +348,7 @@ def _as_in_flight(
     Selecting again may come out otherwise, and two replays would differ. A file of another kind than the
     flight's may need another runtime.
     """
-    changes: dict[str, Any] = {"model": model, "every": 1, "rate_hz": None, "max_age_s": None}
+    changes: dict[str, Any] = {"model": model, "rate_hz": None}
     changes["threads"] = section.threads or threads
     other_kind = kind_of(find_model(model)) != kind_of(find_model(section.model))
     if other_kind and section.runtime in (None, "auto", "torch"):

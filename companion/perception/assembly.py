@@ -66,7 +66,7 @@ def build_pipeline(
     return Pipeline(
         source,
         tiled(settings, detector),
-        selection=settings.detector.selection(),
+        max_rate_hz=settings.detector.rate_hz,
         recorder=recorder,
         tracker=_tracker(settings, first_track_id),
         view_at=_view_at(settings, telemetry),
@@ -108,7 +108,7 @@ def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector 
         return detector
     from vision.tiling import TiledDetector
 
-    return TiledDetector(detector, tile_size=section.tile_size, overlap=section.tile_overlap)
+    return TiledDetector(detector, tile_size=section.image_size)
 
 
 def load_detector(settings: Settings) -> ObjectDetector:
@@ -130,7 +130,7 @@ def load_detector(settings: Settings) -> ObjectDetector:
 def _min_confidence(settings: Settings) -> float:
     """Return the detector's threshold; the tracker also needs detections below `detector.confidence`."""
     confidence, tracker = settings.detector.confidence, settings.tracker
-    return min(confidence, tracker.low_confidence) if tracker.enabled else confidence
+    return min(confidence, tracker.following(confidence).low_confidence) if tracker.enabled else confidence
 
 
 def _tracker(settings: Settings, first_track_id: int) -> Tracker | None:
@@ -162,8 +162,6 @@ def _pose_at(
 
 def _view_at(settings: Settings, telemetry: CameraTelemetry) -> Callable[[Frame], CameraView | None]:
     """Return a function from a frame to the camera's view; None without an attitude at that time."""
-    if not settings.tracker.camera_motion:
-        return lambda _: None
     pose_at, model = _pose_at(settings, telemetry), cache(settings.camera.model)
 
     def view_at(frame: Frame) -> CameraView | None:

@@ -50,7 +50,7 @@ def recorded_frames_names(settings: Settings) -> dict[str | None, str]:
     Empty if images are not recorded, or as JPEG.
     """
     recording = settings.recording
-    if not (recording.directory and recording.images and recording.image_format == "png"):
+    if not (recording.directory and "png" in recording.content):
         return {}
     first = f"companion-{os.getpid()}-{settings.vehicle.name}-recorded"
     return {None: first} | {name: f"{first}-{name}" for name in settings.cameras}

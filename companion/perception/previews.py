@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.perception.messages import CloudPreview, DepthPreview, Preview
 from companion.settings import PreviewSection
-from companion.settings.perception import CameraSection
+from companion.settings.perception import CameraSection, cloud_voxel_m
 from vision.annotate import annotate
 from vision.depth import centre_depth, depth_millimetres
 from vision.detections import Detections
@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 # In the worker the network has priority over preview images.
 _PREVIEW_NICER = 5
+JPEG_QUALITY = 80
 # Bounds a point cloud: at most that many squares of pixels of a larger image.
 MAX_CLOUD_POINTS = 20_000
 
@@ -124,7 +125,7 @@ class PreviewEncoder(_Encoder[Preview | DepthPreview]):
             height = max(1, round(frame.height * self._settings.width / frame.width))
             smaller = cv2.resize(image, (self._settings.width, height), interpolation=cv2.INTER_AREA)
             image = smaller.astype(np.uint8, copy=False)
-        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, self._settings.quality])
+        _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
         return Preview(frame.sequence, frame.captured_ns, jpeg.tobytes())
 
 
@@ -154,5 +155,5 @@ class CloudEncoder(_Encoder[CloudPreview]):
             range_m=(0.0, self._settings.cloud_range_m),
             average=math.ceil(math.sqrt(frame.width * frame.height / MAX_CLOUD_POINTS)),
         )
-        reduced = voxel_grid(cloud, self._settings.cloud_voxel_m)
+        reduced = voxel_grid(cloud, cloud_voxel_m(self._settings.cloud_range_m))
         yield CloudPreview(frame.sequence, frame.captured_ns, len(reduced), reduced.packed())

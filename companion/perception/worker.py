@@ -342,7 +342,7 @@ def _open(begin: Begin, stack: contextlib.ExitStack, sender: ResultSender) -> Pe
     stack.callback(clouds.close)
     processed = None
     if begin.record_as is not None:
-        processed = ProcessedFrames(begin.record_as, depth=settings.recording.depth)
+        processed = ProcessedFrames(begin.record_as, depth="depth" in settings.recording.content)
         stack.callback(processed.close)
     return Perception(source, detector, recording, preview, clouds, processed)
 

@@ -31,6 +31,8 @@ MAX_WAITING, MAX_WAITING_BYTES = 10_000, 512 * 1024 * 1024
 _POLL_S = 0.05
 # The last messages of a service that ends may still arrive.
 _LAST_S = 0.3
+# Then the next file begins.
+MAX_FILE_S = 3600.0
 # A disk with space again, or a folder that has come, is used within this time.
 RETRY_S = 10.0
 
@@ -67,7 +69,6 @@ class RecorderOptions:
     depth: bool
     clouds: bool
     max_file_mb: int
-    max_file_minutes: int
     max_total_mb: int
     frames: Mapping[str, str] = field(default_factory=dict)
 
@@ -84,7 +85,7 @@ class Recorder:
             Path(options.directory),
             options.vehicle,
             max_bytes=options.max_file_mb * 1_000_000,
-            max_duration_s=options.max_file_minutes * 60.0,
+            max_duration_s=MAX_FILE_S,
             max_total_bytes=options.max_total_mb * 1_000_000,
         )
         self._converter = Converter(options.vehicle)

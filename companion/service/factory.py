@@ -41,8 +41,8 @@ def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
         settings.vehicle.url,
         system_id=settings.vehicle.system_id,
         own_system_id=settings.vehicle.system_id,
-        own_component_id=settings.vehicle.component_id,
-        other_component_ids=[number for number in COMPONENT_IDS if number != settings.vehicle.component_id],
+        own_component_id=COMPONENT_IDS[0],
+        other_component_ids=COMPONENT_IDS[1:],
         signing_key=None
         if settings.vehicle.signing_key_file is None
         else read_key(settings.vehicle.signing_key_file),
@@ -120,9 +120,10 @@ async def clients_of(
     """
     programs: dict[str, dict[str, Any]] = {}
     if settings.recording.directory:
-        limits = {"max_file_mb", "max_file_minutes", "max_total_mb"}
-        keys = {"directory", "images", "depth", "clouds", *limits}
-        programs["recorder"] = settings.recording.model_dump(include=keys)
+        recording = settings.recording
+        programs["recorder"] = recording.model_dump(include={"directory", "max_file_mb", "max_total_mb"})
+        programs["recorder"] |= {"images": recording.images}
+        programs["recorder"] |= {kind: kind in recording.content for kind in ("depth", "clouds")}
         programs["recorder"]["frames"] = {
             IMAGE.path(camera): name for camera, name in recorded_frames_names(settings).items()
         }

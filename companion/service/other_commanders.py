@@ -18,7 +18,7 @@ from companion.bus.bodies.service import OtherCommanderBody
 from companion.guidance.interface import CommandInput
 from companion.guidance.limits.battery import needs_charge
 from companion.host.peer_data import PeerDataError, parse_object
-from companion.settings.vehicle import VehicleSection
+from companion.settings.vehicle import COMPONENT_IDS, VehicleSection
 from companion.vehicle.gimbal import Address, address_text
 from companion.vehicle.setpoint_loss import SetpointLossEffect, SetpointLossOutcome
 from companion.vehicle.state import FlightMode, VehicleState
@@ -77,7 +77,7 @@ class OtherCommanders:
         self._service, self._started_ns, self._on_event = service, started_ns, on_event
         self._by_status: dict[str, _Other] = {}
         self._reported: dict[tuple[str, str], _Other] = {}
-        self._address: Address = (settings.system_id, settings.component_id)
+        self._address: Address = (settings.system_id, COMPONENT_IDS[0])
         self._shared = False
         self._offboard_since_ns: int | None = None
         self._foreign_after_s = FOREIGN_OFFBOARD_S

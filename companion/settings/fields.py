@@ -84,8 +84,9 @@ def expectation(field: FieldInfo) -> str:
     elif origin is tuple:
         item = get_args(annotation)[0]
         meaning = _pattern_meaning(get_args(item)[1:]) if str in get_args(item) else None
-        words = "a list of numbers" if item is float else "a list of texts"
-        words += f", each {meaning}" if meaning else ""
+        if get_origin(item) is Literal:
+            meaning = ", ".join(get_args(item))
+        words = "a list of texts" + (f", each {meaning}" if meaning else "")
     else:
         words = _pattern_meaning(field.metadata) or _KINDS[annotation]
     span = _span(field)
@@ -148,8 +149,6 @@ def _without_none(field: FieldInfo) -> tuple[Any, bool]:
 
 
 def _item_from_text(kind: Any, text: str) -> Any:
-    if kind is float:
-        return float(text)
     # A class is a name or an id.
     return int(text) if int in get_args(kind) and re.fullmatch("[0-9]+", text) else text
 

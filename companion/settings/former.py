@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
+
+from companion.settings.perception import cloud_voxel_m, starting_confidence
 
 VERSION = "0.2.0"
 """In which all of these were renamed or removed."""
@@ -27,11 +29,11 @@ class Removed(NamedTuple):
 
     Attributes:
         instead: what to do, in words.
-        value: what holds without it.
+        now: what holds without it, by the other keys of a recorded section.
     """
 
     instead: str
-    value: Any = None
+    now: Callable[[Mapping[str, Any]], Any]
 
 
 _LENS_FILE = "write a calibration file, and set camera.calibration_file"
@@ -47,8 +49,57 @@ LENS: dict[str, Any] = {
 }
 """Former key of a lens in `camera` → its default. `lens_line` has what replaces them all."""
 
+
+def _same(value: Any) -> Callable[[Mapping[str, Any]], Any]:
+    return lambda _: value
+
+
+_CONTENT = 'recording.content lists what is recorded beside the messages: "jpeg" or "png", "depth", "clouds"'
 REMOVED = {
-    **{f"camera.{name}": Removed(_LENS_FILE, value) for name, value in LENS.items()},
+    **{f"camera.{name}": Removed(_LENS_FILE, _same(was)) for name, was in LENS.items()},
+    "detector.every": Removed(
+        "set detector.rate_hz, the source's rate divided by it; 1 is no limit", _same(1)
+    ),
+    "detector.max_age_s": Removed(
+        "remove it: guidance.perception_max_age_s limits the age of what is flown by", _same(None)
+    ),
+    "detector.tile_overlap": Removed("remove it: tiles overlap by 0.2 of their side", _same(0.2)),
+    "detector.tile_size": Removed(
+        "remove it: a tile has the size of the network's input, detector.image_size",
+        lambda detector: detector["image_size" if detector.get("tiles") else "tile_size"],
+    ),
+    "preview.cloud_voxel_m": Removed(
+        "set preview.cloud_range_m: a point is of a cube whose side is 1/200 of it",
+        lambda preview: cloud_voxel_m(preview["cloud_range_m"]),
+    ),
+    "preview.quality": Removed(
+        "remove it: images have JPEG quality 80; preview.width and preview.rate_hz reduce the data",
+        _same(80),
+    ),
+    "recording.clouds": Removed(_CONTENT, lambda recording: recording["clouds"]),
+    "recording.depth": Removed(_CONTENT, lambda recording: recording["depth"]),
+    "recording.image_format": Removed(_CONTENT, lambda recording: recording["image_format"]),
+    "recording.images": Removed(_CONTENT, lambda recording: recording["images"]),
+    "recording.max_file_minutes": Removed(
+        "remove it: the next file begins after an hour, or earlier at recording.max_file_mb", _same(60)
+    ),
+    "source.realtime": Removed(
+        "set source.every_frame, its opposite: true reads a file as fast as its frames are processed",
+        _same(True),
+    ),
+    "tracker.camera_motion": Removed(
+        "remove it: the camera's rotation is compensated wherever the vehicle's attitude is known; "
+        "vehicle.url = none for a recorded video",
+        _same(True),
+    ),
+    "tracker.high_confidence": Removed(
+        "set tracker.confirm_score: a track starts from there, at most from 0.35",
+        lambda tracker: starting_confidence(tracker["confirm_score"]),
+    ),
+    "tracker.low_confidence": Removed("remove it: a track goes on with detections from 0.1", _same(0.1)),
+    "vehicle.component_id": Removed(
+        "remove it: the service takes 191, or another one of 192 to 194 where a program has it", _same(191)
+    ),
 }
 """Former key → what to do instead."""
 
@@ -83,7 +134,11 @@ def without_removed(sections: Mapping[str, Any], changed: list[str], prefix: str
         kept[section] = _with_lens(content) if section == "camera" else dict(content)
         for name, value in content.items():
             removed = REMOVED.get(f"{section}.{name}")
-            if removed is not None and kept[section].pop(name, removed.value) != removed.value:
+            if (
+                removed is not None
+                and name in kept[section]
+                and kept[section].pop(name) != removed.now(content)
+            ):
                 changed.append(f"recorded with {prefix}{section}.{name} = {value}: {removed.instead}")
     return kept
 

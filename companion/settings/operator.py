@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from companion.settings.perception import VideoSection
 from companion.settings.section import Section
@@ -25,20 +25,23 @@ class RecordingSection(VideoSection):
 
     directory: str = ""
     """folder of the MCAP recordings, one per run (extra `recording`); empty: none"""
-    images: bool = True
-    """record images too"""
-    image_format: Literal["jpeg", "png"] = "jpeg"
-    """jpeg: the preview images; png: each processed frame without losses, by the service's own recorder"""
-    depth: bool = False
-    """record depth images too; some 114 to 180 MB a minute and 14 % of a core at 640x480 and 15 Hz"""
-    clouds: bool = False
-    """record the point clouds of cameras with depth too; some 0.2 MB/s"""
+    content: tuple[Literal["jpeg", "png", "depth", "clouds"], ...] = ("jpeg",)
+    """beside messages: preview images (jpeg) or whole processed frames (png), depth images, point clouds"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
-    """size at which the next file begins, megabytes"""
-    max_file_minutes: Annotated[int, Field(ge=1, le=10_000)] = 60
-    """duration after which the next file begins, minutes"""
+    """size at which the next file begins, megabytes; it also begins after an hour"""
     max_total_mb: Annotated[int, Field(ge=1, le=100_000_000)] = 10_000
     """size of all recordings in the folder, megabytes; the oldest are removed"""
+
+    @model_validator(mode="after")
+    def _one_kind_of_images(self) -> Self:
+        if {"jpeg", "png"} <= set(self.content):
+            raise ValueError("content: jpeg and png are the same images: remove one of them")
+        return self
+
+    @property
+    def images(self) -> bool:
+        """Whether images are recorded, of either kind."""
+        return not {"jpeg", "png"}.isdisjoint(self.content)
 
 
 class FoxgloveSection(Section):

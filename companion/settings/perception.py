@@ -16,7 +16,6 @@ from vision.calibration_files.camera_info import read_camera_info, read_registra
 from vision.camera_model import CameraModel, CameraMount, pixels_without_rays, scaled_to_frames
 from vision.class_names import fold_name
 from vision.frame import Frame
-from vision.frame_selection import Selection
 from vision.home import expanded
 from vision.marker_boards import Board
 from vision.marker_dictionaries import dictionary_named
@@ -62,10 +61,8 @@ class SourceSection(Section):
     """calibration of a depth camera that is not registered, as companion calibrate extrinsics writes it"""
     loop: bool = False
     """repeat a file or folder; not with depth"""
-    realtime: bool = True
-    """play a file or folder at its frame rate, like a camera; false: every frame, as fast as possible"""
-    every_frame: bool | None = None
-    """pipes only: true: every frame, the writer waits; false: the newest; unset: true for a regular file"""
+    every_frame: bool = False
+    """of a file or pipe, as fast as they are processed; false: the newest one, a file at its frame rate"""
     open_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
     """timeout of the first frame at start, seconds"""
     read_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 5.0
@@ -86,7 +83,8 @@ class SourceSection(Section):
 
     def opening(self, on_frame: Callable[[Frame], None] | None = None) -> SourceSettings:
         """Convert for `vision.sources.open_source`. Raises ValueError for an invalid pixel format."""
-        return SourceSettings(**self.model_dump(exclude={"uri", "share"}), on_frame=on_frame)
+        values = self.model_dump(exclude={"uri", "share"})
+        return SourceSettings(**values, realtime=not self.every_frame, on_frame=on_frame)
 
 
 # Focal length over the image's size: of a pinhole camera of 179° and of 1°.
@@ -240,20 +238,12 @@ class DetectorSection(Section):
     """CPU threads of the network; unset: all processors but one, divided among the cameras"""
     priority: Literal["low", "idle"] = "low"
     """of the perception process; idle: it runs when the service and what it starts need no processor"""
-    every: Annotated[int, Field(ge=1, le=1000)] = 1
-    """process every Nth frame"""
     rate_hz: Annotated[float | None, Field(gt=0, le=1000)] = None
     """maximum rate of processed frames, Hz; unset: no limit"""
-    max_age_s: Annotated[float | None, Field(gt=0, le=3600)] = None
-    """maximum age of a processed frame since its capture, seconds; unset: no limit"""
     class_heights_m: tuple[Annotated[str, HEIGHT_TEXT], ...] = ("person:1.7", "car:1.5", "bicycle:1.1")
     """class:metres, known object heights; range estimate where neither depth nor the ground gives one"""
     tiles: bool = False
-    """also detect in tiles of large frames, for small objects; 1080p takes some 14 times as long"""
-    tile_size: Annotated[int, Field(ge=64, le=4096)] = 640
-    """side of a tile, pixels of the frame; best equal to image_size"""
-    tile_overlap: Annotated[float, Field(ge=0, le=0.8)] = 0.2
-    """overlap of neighbouring tiles, share of a tile"""
+    """also detect in tiles of image_size, for small objects; 1080p takes some 14 times as long"""
 
     @model_validator(mode="after")
     def _idle_on_linux(self) -> Self:
@@ -286,10 +276,6 @@ class DetectorSection(Section):
             runtime=self.runtime,
         )
 
-    def selection(self) -> Selection:
-        """Return the selection of processed frames."""
-        return Selection(self.every, self.rate_hz, self.max_age_s)
-
     def heights(self) -> dict[str, float]:
         """Return class name, as of `fold_name`, → metres."""
         pairs = (text.rpartition(":") for text in self.class_heights_m)
@@ -301,10 +287,6 @@ class TrackerSection(Section):
 
     enabled: bool = True
     """enable tracking; false: frames are independent, and all detections are used"""
-    high_confidence: Annotated[float, Field(ge=0, le=1)] = 0.35
-    """minimum confidence to start a track (at least detector.confidence)"""
-    low_confidence: Annotated[float, Field(ge=0, le=1)] = 0.1
-    """minimum confidence to continue a track; such detections are kept despite detector.confidence"""
     confirm_score: Annotated[float, Field(ge=0, le=1)] = 0.4
     """minimum median confidence of a confirmed track; only confirmed tracks are targets"""
     min_hits: Annotated[int, Field(ge=1, le=1000)] = 3
@@ -313,8 +295,6 @@ class TrackerSection(Section):
     """time without detections after which a track is lost, seconds"""
     max_age_s: Annotated[float, Field(gt=0, le=600)] = 2.0
     """time without detections after which a track ends; a later detection starts a new one; seconds"""
-    camera_motion: bool = True
-    """compensate the camera's rotation by the vehicle's attitude; false for recorded videos"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -323,9 +303,18 @@ class TrackerSection(Section):
 
     def following(self, confidence: float) -> TrackerSettings:
         """Convert for `vision.tracking`, with the detector's `confidence`."""
-        values = self.model_dump(exclude={"enabled", "camera_motion"})
-        values["high_confidence"] = max(self.high_confidence, confidence)
-        return TrackerSettings(keep_confidence=confidence, **values)
+        starting = max(starting_confidence(self.confirm_score), confidence)
+        return TrackerSettings(
+            high_confidence=starting,
+            low_confidence=min(TrackerSettings().low_confidence, starting),
+            keep_confidence=confidence,
+            **self.model_dump(exclude={"enabled"}),
+        )
+
+
+def starting_confidence(confirm_score: float) -> float:
+    """Return the least confidence that starts a track: `confirm_score`, at most the tracker's default."""
+    return min(TrackerSettings().high_confidence, confirm_score)
 
 
 class MarkersSection(Section):
@@ -423,15 +412,16 @@ class PreviewSection(Section):
 
     rate_hz: Annotated[float, Field(gt=0, le=60)] = 15.0
     """maximum rate, Hz"""
-    quality: Annotated[int, Field(ge=1, le=100)] = 80
-    """JPEG quality"""
     width: Annotated[int, Field(ge=16, le=4096)] = 1280
     """maximum width, pixels; larger frames are scaled down"""
     annotate: bool = False
     """draw the detections; the dashboard draws them itself"""
     cloud_rate_hz: Annotated[float, Field(gt=0, le=30)] = 2.0
     """maximum rate of point clouds, Hz"""
-    cloud_voxel_m: Annotated[float, Field(ge=0.02, le=5)] = 0.1
-    """one point of a point cloud per cube of this side, metres; at most 20,000 points"""
     cloud_range_m: Annotated[float, Field(gt=0, le=1000)] = 20.0
-    """maximum depth in a point cloud, metres"""
+    """maximum depth in a point cloud, metres; one point per cube of 1/200 of it, at most 20,000 points"""
+
+
+def cloud_voxel_m(cloud_range_m: float) -> float:
+    """Return the side of the cubes of which a published point cloud has one point each, metres."""
+    return cloud_range_m / 200.0

@@ -160,6 +160,8 @@ class Settings(Section):
             return self.model_copy(update={"cameras": {}})
         sections = self.cameras[name]
         own = {section: getattr(sections, section) for section in CameraSections.model_fields}
+        # What is recorded beside its video is one setting for all cameras.
+        own["recording"] = self.recording.model_copy(update=dict(sections.recording))
         return self.model_copy(update={"cameras": {}, **own})
 
 

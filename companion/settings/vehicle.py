@@ -10,7 +10,7 @@ from companion.settings.section import Section
 from companion.settings.texts import KeyWord, VehicleUrl
 
 NO_VEHICLE = "none"
-# MAV_COMP_ID_ONBOARD_COMPUTER to MAV_COMP_ID_ONBOARD_COMPUTER4
+# Ours is the first that no other program has: MAV_COMP_ID_ONBOARD_COMPUTER to …COMPUTER4.
 COMPONENT_IDS = (191, 192, 193, 194)
 
 
@@ -23,8 +23,6 @@ class VehicleSection(Section):
     """MAVLink library; pymavlink (also auto) flies PX4 and ArduPilot, mavsdk (an extra) PX4 only"""
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     """the autopilot's MAVLink system id"""
-    component_id: Annotated[int, Field(ge=COMPONENT_IDS[0], le=COMPONENT_IDS[-1])] = COMPONENT_IDS[0]
-    """our MAVLink component id; where another program has it, another one of 191 to 194 is used"""
     name: KeyWord = "vehicle1"
     """the vehicle's name in zenoh keys: companion/NAME/detections"""
     connect_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0

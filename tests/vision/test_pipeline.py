@@ -13,7 +13,6 @@ from vision.camera_model import CameraModel
 from vision.depth import surfaces
 from vision.detections import Detections
 from vision.frame import Frame
-from vision.frame_selection import Selection
 from vision.object_detector import Timing
 from vision.pipeline import PerceptionResult, Pipeline
 from vision.sources import EndOfStream, Source, SourceSettings, SourceStatistics, open_source
@@ -114,14 +113,17 @@ def test_depth_gives_every_detection_its_range() -> None:
     assert np.isnan(none.detections.depth_m).all()
 
 
-def test_only_every_nth_frame_is_processed() -> None:
-    pipeline = Pipeline(
-        Frames(*(frame_of(number) for number in range(7))), BrightSpot(), selection=Selection(every=3)
-    )
+def tenths_of_a_second(*frames: Frame) -> Frames:
+    return Frames(*(replace(frame, captured_ns=frame.sequence * 100_000_000) for frame in frames))
+
+
+def test_only_frames_up_to_the_rate_are_processed() -> None:
+    frames = tenths_of_a_second(*(frame_of(number) for number in range(7)))
+    pipeline = Pipeline(frames, BrightSpot(), max_rate_hz=1 / 0.3)
     assert [result.sequence for result in run(pipeline)] == [0, 3, 6]
     assert pipeline.frames == 7
     assert pipeline.dropped == 0
-    assert pipeline.frames_skipped == {"replaced": 0, "unreadable": 0, "every": 4, "rate": 0, "too_old": 0}
+    assert pipeline.frames_skipped == {"replaced": 0, "unreadable": 0, "rate": 4}
 
 
 def test_frames_that_the_source_lost_are_counted() -> None:
@@ -129,16 +131,6 @@ def test_frames_that_the_source_lost_are_counted() -> None:
     results = run(pipeline)
     assert [result.dropped for result in results] == [1, 1, 4]
     assert [result.frames_skipped["replaced"] for result in results] == [1, 1, 4]
-
-
-def test_too_old_frame_is_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
-    second_ago_ns = time.monotonic_ns() - 1_000_000_000
-    frames = Frames(*(replace(frame_of(number), captured_ns=second_ago_ns) for number in range(2)))
-    pipeline = Pipeline(frames, BrightSpot(), selection=Selection(max_age_s=0.5))
-    assert run(pipeline) == []
-    assert pipeline.dropped == pipeline.frames_skipped["too_old"] == 2
-    (line,) = caplog.messages
-    assert "max_age_s" in line
 
 
 def test_arrival_decoding_and_waiting_are_timed_separately() -> None:
@@ -250,5 +242,5 @@ def test_every_frame_is_recorded_with_the_newest_detections() -> None:
     dark = Frame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic_ns(), 3)
     recorder = Kept()
     frames = [frame_of(0), frame_of(1), frame_of(2), dark]
-    run(Pipeline(Frames(*frames), BrightSpot(), selection=Selection(every=3), recorder=recorder))
+    run(Pipeline(tenths_of_a_second(*frames), BrightSpot(), max_rate_hz=1 / 0.3, recorder=recorder))
     assert recorder.kept == [(0, 1), (1, 1), (2, 1), (3, 0)]

@@ -131,8 +131,7 @@ function onStatus(status) {
     if (!view || view.state === "stopped") continue;
     camera(name).status = view;
     dropped += view.dropped || 0;
-    const { every = 0, rate = 0 } = view.frames_skipped || {};
-    skipped += every + rate;
+    skipped += (view.frames_skipped || {}).rate || 0;
   }
   const before = state.lost;
   const now = performance.now();

@@ -441,7 +441,7 @@ def test_old_flag_names_the_new_one_in_every_command(
 
 def test_old_flag_is_reported_with_all_other_faults(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text("[tracker]\nlost_s = 1.0\n[detector]\nimage_size = 1\n")
-    done = companion_here("run", "--tracker-true-score", "0.3", "--detector-every", "none", cwd=tmp_path)
+    done = companion_here("run", "--tracker-true-score", "0.3", "--detector-every", "2", cwd=tmp_path)
     assert done.returncode == 2
     lines = done.stderr.splitlines()
     for key in ("tracker.confirm_score", "tracker.coast_timeout_s", "detector.image_size", "detector.every"):

@@ -185,7 +185,7 @@ def mounted(done: Done) -> None:
     ]
 
 
-_ALL = "--period 0 --source-realtime false"
+_ALL = "--period 0 --source-every-frame true"
 ROWS = (
     Row("preview", f"{_ALL} --save {{}}/out", preview_saves((WIDTH, HEIGHT)), ends=False),
     Row("preview", f"{_ALL} --save {{}}/out --grey", preview_saves((WIDTH // 3, HEIGHT // 3)), ends=False),
@@ -262,13 +262,12 @@ WITH_A_BOARD = {
 # Of the service's worker, below; and of its recorder, which gets messages, whatever the source is.
 OF_THE_WORKER = {
     "recording.video": "video.webm", "recording.rate_hz": "20", "recording.level": "true",
-    "recording.directory": "recordings", "recording.images": "true", "recording.image_format": "png",
-    "recording.depth": "true", "preview.rate_hz": "60", "preview.quality": "90", "preview.width": "192",
-    "preview.annotate": "true", "preview.cloud_rate_hz": "30", "preview.cloud_voxel_m": "0.1",
-    "preview.cloud_range_m": "10",
+    "recording.directory": "recordings", "recording.content": "png,depth",
+    "preview.rate_hz": "60", "preview.width": "192",
+    "preview.annotate": "true", "preview.cloud_rate_hz": "30", "preview.cloud_range_m": "10",
 }  # fmt: skip
 OF_THE_RECORDER = {
-    "recording.clouds", "recording.max_file_mb", "recording.max_file_minutes", "recording.max_total_mb",
+    "recording.max_file_mb", "recording.max_total_mb",
 }  # fmt: skip
 # What a source is, and how to wait for it. `source.depth` is the kind "depth".
 SOURCE_ITSELF = {

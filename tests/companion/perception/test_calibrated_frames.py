@@ -30,7 +30,7 @@ def test_frames_of_another_aspect_ratio_end_the_source(
         os.devnull,
         {
             "source.uri": str(folder),
-            "source.realtime": "false",
+            "source.every_frame": "true",
             "detector.enabled": "false",
             "camera.calibration_file": str(lens),
         },

@@ -154,8 +154,6 @@ def settings(tmp_path: Path, exported_model: Path) -> Settings:
         "detector.threads": "1",
         "detector.precision": "float32",
         "detector.confidence": "0",
-        "tracker.high_confidence": "0",
-        "tracker.low_confidence": "0",
         "tracker.confirm_score": "0",
         "tracker.max_age_s": "600",
     }

@@ -298,7 +298,7 @@ def few_images(image_folder: Path, tmp_path: Path) -> Path:
 async def test_last_message_is_read_after_failed_writes(
     few_images: Path,
 ) -> None:
-    overrides = {"source.uri": str(few_images), "source.realtime": "false", "detector.enabled": "false"}
+    overrides = {"source.uri": str(few_images), "source.every_frame": "true", "detector.enabled": "false"}
     settings = load_settings(Path(os.devnull), overrides, environment={})
     process = await PerceptionProcess.spawn(settings, subprocess.DEVNULL)
     # Nothing is read until it has ended, as when the service's own loop is blocked.

@@ -130,7 +130,7 @@ def test_depth_images_are_of_the_frames_of_the_images(images: bool) -> None:
 
 
 def test_cloud_has_points_and_colours_of_the_frame() -> None:
-    (cloud,) = clouds_of(PreviewSection(cloud_voxel_m=0.5), [wall(160, 120, 500_000_000)])
+    (cloud,) = clouds_of(PreviewSection(cloud_range_m=100.0), [wall(160, 120, 500_000_000)])
     assert (cloud.sequence, cloud.captured_ns) == (5, 500_000_000)
     points = np.frombuffer(cloud.data, [("xyz", "<f4", 3), ("rgba", "u1", 4)])
     assert len(points) == cloud.points > 50
@@ -138,7 +138,7 @@ def test_cloud_has_points_and_colours_of_the_frame() -> None:
 
 
 def test_clouds_of_large_frames_are_bounded() -> None:
-    (cloud,) = clouds_of(PreviewSection(cloud_voxel_m=0.02), [wall(1920, 1080)])
+    (cloud,) = clouds_of(PreviewSection(cloud_range_m=5.0), [wall(1920, 1080)])
     assert 10_000 < cloud.points <= MAX_CLOUD_POINTS
     assert len(cloud.data) <= 320_000
 

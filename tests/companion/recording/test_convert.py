@@ -310,7 +310,7 @@ def test_lost_steps_are_counted(converter: Converter) -> None:
 
 def test_recorder_of_lossless_images_does_not_get_the_preview() -> None:
     frames = {"image": "frames"}
-    options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, True, 1, 1, 1, frames)
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", True, True, True, 1, 1, frames)
     names = [topic.name for topic in topics_of(options)]
     assert ("image" in names, "depth_image" in names, "cloud" in names) == (False, False, True)
 
@@ -324,14 +324,18 @@ def test_format_of_an_image_is_named(converter: Converter, encoding: str, kind: 
 
 @pytest.mark.parametrize("chosen", [(True, False, False), (False, True, False), (False, False, True)])
 def test_recorder_subscribes_to_the_chosen_large_topics(chosen: tuple[bool, bool, bool]) -> None:
-    options = RecorderOptions(ZenohSection(), "vehicle1", "", *chosen, 1, 1, 1)
+    options = RecorderOptions(ZenohSection(), "vehicle1", "", *chosen, 1, 1)
     names = [topic.name for topic in topics_of(options)]
     assert ("image" in names, "depth_image" in names, "cloud" in names) == chosen
     assert names[-1] == "@record/mavlink"
     assert len(names) == len(TOPICS) - 2 + len(RECORDER_TOPICS)
 
 
-@pytest.mark.parametrize("chosen", [{}, {"recording.depth": "true"}])
-def test_images_are_recorded_by_default_and_depth_if_chosen(chosen: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("chosen", "content"), [({}, ("jpeg",)), ({"recording.content": "png, depth"}, ("png", "depth"))]
+)
+def test_images_are_recorded_by_default_and_depth_if_chosen(
+    chosen: dict[str, str], content: tuple[str, ...]
+) -> None:
     recording = load_settings(os.devnull, chosen, {}).recording
-    assert (recording.images, recording.depth, recording.clouds) == (True, bool(chosen), False)
+    assert (recording.content, recording.images) == (content, True)

@@ -130,23 +130,26 @@ def test_memory_that_cannot_be_made_ends_only_the_images(caplog: pytest.LogCaptu
 
 
 def test_only_png_images_of_a_recording_are_shared(tmp_path: Path) -> None:
-    png = {"recording.directory": str(tmp_path), "recording.image_format": "png"}
+    png = {"recording.directory": str(tmp_path), "recording.content": "png"}
 
     def names(**changes: str) -> dict[str | None, str]:
         values = png | {f"recording.{key}": value for key, value in changes.items()}
         return recorded_frames_names(load_settings(os.devnull, values, {}))
 
     assert list(names()) == [None]
-    assert names(image_format="jpeg") == names(images="false") == names(directory="") == {}
+    assert names(content="jpeg") == names(content="depth") == names(directory="") == {}
 
 
 def test_each_camera_has_its_own_shared_memory(tmp_path: Path) -> None:
     settings = {
         "recording.directory": str(tmp_path),
-        "recording.image_format": "png",
+        "recording.content": "png",
         "cameras.camera.source.uri": "none",
         "cameras.recorded.source.uri": "none",
     }
-    names = recorded_frames_names(load_settings(os.devnull, settings, {}))
+    read = load_settings(os.devnull, settings, {})
+    names = recorded_frames_names(read)
+    # Its worker shares what the one setting says.
+    assert [read.of_camera(name).recording.content for name in (None, "camera")] == [("png",)] * 2
     assert list(names) == [None, "camera", "recorded"]
     assert len(set(names.values())) == 3

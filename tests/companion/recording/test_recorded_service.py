@@ -92,7 +92,7 @@ def test_flight_is_recorded_and_replays(image_folder: Path, exported_model: Path
         *("--detector-model", str(exported_model), "--detector-runtime", "onnxruntime"),
         *("--detector-image-size", "160", "--detector-confidence", "0", "--detector-iou", "0.3"),
         *("--tracker-enabled", "false"),
-        *("--recording-directory", str(folder), "--recording-image-format", "png"),
+        *("--recording-directory", str(folder), "--recording-content", "png"),
     ]
     with (
         running_simulator(**TWICE) as simulator,

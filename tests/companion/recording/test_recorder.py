@@ -29,7 +29,6 @@ def options(folder: Path, endpoint: str = "tcp/127.0.0.1:7447") -> RecorderOptio
         depth=False,
         clouds=False,
         max_file_mb=100,
-        max_file_minutes=10,
         max_total_mb=1000,
     )
 

@@ -28,7 +28,6 @@ def options(folder: Path) -> RecorderOptions:
         depth=False,
         clouds=False,
         max_file_mb=100,
-        max_file_minutes=60,
         max_total_mb=1000,
     )
 

@@ -133,7 +133,7 @@ def test_a_video_with_doubled_frames_stays_fresh(each: int) -> None:
 def test_every_second_frame_of_doubled_ones_is_new() -> None:
     bench = Bench(*IN_FLIGHT)
     for number in range(50):
-        # The first of each pair was left out by `detector.every`.
+        # The first of each pair was left out by `detector.rate_hz`.
         bench._first_ns["image", number] = bench.now_ns + PERIOD_NS // 2
         assert bench.age_s(bench.show(number)) == 0.0
 

@@ -315,7 +315,7 @@ def test_printed_settings_round_trip(
 
 
 def test_source_settings_of_the_source_section() -> None:
-    opening = load_settings(None, {"source.width": "640", "source.realtime": "no"}, {}).source.opening()
+    opening = load_settings(None, {"source.width": "640", "source.every_frame": "yes"}, {}).source.opening()
     assert (opening.width, opening.realtime, opening.loop) == (640, False, False)
 
 
@@ -414,11 +414,25 @@ def test_keys_of_a_lens_give_the_calibration_file(tmp_path: Path) -> None:
     assert "data: [500, 0, CX, 0, FY, CY, 0, 0, 1]" in alone
 
 
+FORMER_DEFAULTS = {
+    "detector": {"every": 1, "max_age_s": None, "tile_size": 640, "tile_overlap": 0.2},
+    "preview": {"quality": 80, "cloud_voxel_m": 0.1},
+    "recording": {"images": True, "image_format": "jpeg", "depth": False, "clouds": False}
+    | {"max_file_minutes": 60},
+    "source": {"realtime": True},
+    "tracker": {"high_confidence": 0.35, "low_confidence": 0.1, "camera_motion": True},
+    "vehicle": {"component_id": 191},
+}
+
+
 def test_recorded_settings_are_read_without_removed_keys() -> None:
     json_able = Settings.model_validate({"camera": {"mount_pitch_deg": -30.0}}).model_dump(mode="json")
-    for old, removed in REMOVED.items():
+    for old in REMOVED:
         section, _, name = old.partition(".")
-        json_able[section][name] = removed.value
+        if section == "camera":
+            json_able[section][name] = LENS[name]
+        else:
+            json_able[section] |= FORMER_DEFAULTS.get(section, {})
     changed_keys: list[str] = []
     read = Settings.from_json(without_removed(json_able, changed_keys))
     assert (read.camera.mount_pitch_deg, read.camera.lens, changed_keys) == (-30.0, None, [])
@@ -436,6 +450,25 @@ def test_recorded_settings_are_read_without_removed_keys() -> None:
     )
     assert read.camera.lens == read.cameras["down"].camera.lens == LENS_MODEL
     assert changed_keys == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "lines"),
+    [
+        ("tracker.high_confidence", 0.5, 1),
+        ("tracker.camera_motion", False, 1),
+        ("detector.tile_size", 320, 0),  # without `tiles`
+        ("detector.every", 2, 1),
+        ("preview.cloud_voxel_m", 0.2, 1),
+    ],
+)
+def test_recorded_value_that_no_longer_holds_is_named(key: str, value: object, lines: int) -> None:
+    section, _, name = key.partition(".")
+    json_able = Settings().model_dump(mode="json", include={section})
+    json_able[section][name] = value
+    changed_keys: list[str] = []
+    Settings.from_json(without_removed(json_able, changed_keys))
+    assert [key in line for line in changed_keys] == [True] * lines
 
 
 def test_recorded_lens_is_read_without_its_file(tmp_path: Path) -> None:
