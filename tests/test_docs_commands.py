@@ -97,7 +97,7 @@ PRINTED = {"zenoh-security.md": ("vehicle1.json5", "companion.toml", "operator.j
 # What the reader has running beforehand: in place of an autopilot's SITL the simulated vehicle.
 RUNNING = {"sitl.md": ("mavlink-sim",)}
 # More than 40 s of processor time.
-SLOW = {"cameras.md", "models.md", "record-and-replay.md", "train.md"}
+SLOW = {"calibrate.md", "cameras.md", "models.md", "record-and-replay.md", "train.md"}
 
 
 def run_lines(page: Path) -> Iterator[str]:
