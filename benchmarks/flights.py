@@ -139,7 +139,7 @@ def add_workers(parser: argparse.ArgumentParser) -> None:
     """The options of `map_seeds`."""
     workers = parser.add_mutually_exclusive_group()
     workers.add_argument("--processes", type=_count, default=1, help="seeds at once")
-    workers.add_argument("--ray", metavar="HOST:PORT", help="run on this Ray cluster (extra cluster)")
+    workers.add_argument("--ray", metavar="HOST:PORT", help="run on this Ray cluster (extra learn)")
 
 
 def add_seeds(parser: argparse.ArgumentParser, default: str) -> None:

@@ -6,35 +6,35 @@ Imports nothing, for it is read where much is missing.
 from __future__ import annotations
 
 EXTRA_OF = {
-    "aioconsole": "console",
-    "av": "video",
-    "cuda": "tensorrt",
-    "depthai": "oak",
-    "foxglove": "foxglove",
-    "gymnasium": "rl",
-    "httpx": "llm",
-    "mavsdk": "mavsdk",
+    "aioconsole": "service",
+    "av": "cameras",
+    "cuda": "nvidia",
+    "depthai": "cameras",
+    "foxglove": "recording",
+    "gymnasium": "learn",
+    "httpx": "language",
+    "mavsdk": "service",
     "mcap": "recording",
-    "mcp": "mcp",
-    "mcp_types": "mcp",
-    "onnx": "torch",
-    "OpenEXR": "exr",
-    "openvino": "openvino",
-    "prometheus_client": "metrics",
-    "pyrealsense2": "realsense",
+    "mcp": "language",
+    "mcp_types": "language",
+    "onnx": "models",
+    "OpenEXR": "cameras",
+    "openvino": "models",
+    "prometheus_client": "service",
+    "pyrealsense2": "cameras",
     "pyulog": "recording",
-    "ray": "cluster",
-    "small_gicp": "cloud",
-    "stable_baselines3": "rl",
-    "tensorboard": "rl",
-    "tensorrt": "tensorrt",
-    "torch": "torch",
+    "ray": "learn",
+    "small_gicp": "cameras",
+    "stable_baselines3": "learn",
+    "tensorboard": "learn",
+    "tensorrt": "nvidia",
+    "torch": "models",
 }
 """Module → extra."""
 
 
 def install_command(module: str) -> str:
-    """What installs a module, such as `pip install 'mavlink-companion[torch]'`."""
+    """What installs a module, such as `pip install 'mavlink-companion[models]'`."""
     extra = EXTRA_OF.get(module.partition(".")[0])
     return f"pip install {module}" if extra is None else f"pip install 'mavlink-companion[{extra}]'"
 

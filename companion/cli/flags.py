@@ -58,7 +58,7 @@ Processes = Annotated[int, typer.Option(min=1, help="With --seeds: number of see
 RayAddress = Annotated[
     str | None,
     typer.Option(
-        "--ray", metavar="HOST:PORT", help="With --seeds: run them on this Ray cluster (extra cluster)."
+        "--ray", metavar="HOST:PORT", help="With --seeds: run them on this Ray cluster (extra learn)."
     ),
 ]
 

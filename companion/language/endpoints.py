@@ -65,7 +65,7 @@ def endpoint_of(url: str, model: str, *, key: str | None = None, timeout_s: floa
     """The model at an address: OpenAI's format where its path ends with /v1, else Ollama's.
 
     Raises:
-        LanguageError: the extra `llm` is not installed.
+        LanguageError: the extra `language` is not installed.
     """
     try:
         import httpx  # noqa: F401

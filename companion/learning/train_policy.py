@@ -1,6 +1,6 @@
 """`companion train-policy`: train a policy in an environment of `mavlink_sim.environments`, and write it.
 
-The algorithms are those of Stable-Baselines3 (extra `rl`). The network sees the observation normalized by
+The algorithms are those of Stable-Baselines3 (extra `learn`). The network sees the observation normalized by
 its running mean and deviation, and acts in -1..1; both scalings become part of the written file. The same
 seed gives the same weights on one machine.
 """

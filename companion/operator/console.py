@@ -69,7 +69,7 @@ async def _read_commands(
     help_text: str,
     ask: Ask | None,
 ) -> None:
-    # Of the extra `console`.
+    # Of the extra `service`.
     from aioconsole.stream import StandardStreamReader, StandardStreamReaderProtocol
 
     _print(_BANNER)

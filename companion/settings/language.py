@@ -14,7 +14,7 @@ class LanguageSection(Section):
     """The language model of `companion ask`, and of the chat in page and console."""
 
     url: Annotated[str, HTTP_URL] = "http://127.0.0.1:11434"
-    """address of Ollama, or of an OpenAI-compatible endpoint, which ends with /v1 (extra `llm`)"""
+    """address of Ollama, or of an OpenAI-compatible endpoint, which ends with /v1 (extra `language`)"""
     model: str = ""
     """name of the model; empty: plain sentences are read by patterns, without a model"""
     key_file: str | None = None

@@ -48,14 +48,14 @@ class FoxgloveSection(Section):
     """Live data for Foxglove."""
 
     listen: Annotated[str | None, HOST_AND_PORT] = None
-    """HOST:PORT of Foxglove's WebSocket, such as 127.0.0.1:8765 (extra `foxglove`); unset: disabled"""
+    """HOST:PORT of Foxglove's WebSocket, such as 127.0.0.1:8765 (extra `recording`); unset: disabled"""
 
 
 class MetricsSection(Section):
     """Metrics for a monitoring system."""
 
     listen: Annotated[str | None, HOST_AND_PORT] = None
-    """HOST:PORT of the Prometheus endpoint /metrics (extra `metrics`); unset: disabled"""
+    """HOST:PORT of the Prometheus endpoint /metrics (extra `service`); unset: disabled"""
 
 
 class LogSection(Section):

@@ -394,7 +394,7 @@ class VideoSection(Section):
     video: str | None = None
     """file of the annotated video, .webm; unset: none"""
     rate_hz: Annotated[float, Field(ge=0.1, le=240)] = 15.0
-    """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `video`, up to 150 without"""
+    """frame rate, Hz; one of 640x480 costs some 20 ms of a core with the extra `cameras`, else up to 150"""
     level: bool = False
     """level the video's images by the attitude at capture, row by row with camera.rolling_shutter_ms"""
 

@@ -20,7 +20,7 @@ class VehicleSection(Section):
     url: VehicleUrl = "udpin://127.0.0.1:14540"
     """udpin:// (listen), udpout:// or tcp://HOST:PORT, serial:///dev/ttyAMA0:921600; none: no vehicle"""
     driver: Literal["pymavlink", "mavsdk", "auto"] = "pymavlink"
-    """MAVLink library; pymavlink (also auto) flies PX4 and ArduPilot, mavsdk (an extra) PX4 only"""
+    """MAVLink library; pymavlink (also auto) flies PX4 and ArduPilot, mavsdk (extra `service`) PX4 only"""
     system_id: Annotated[int, Field(ge=1, le=255)] = 1
     """the autopilot's MAVLink system id"""
     name: KeyWord = "vehicle1"

@@ -1,4 +1,4 @@
-"""One function over many seeds: in this process, in several, or on a Ray cluster (extra `cluster`).
+"""One function over many seeds: in this process, in several, or on a Ray cluster (extra `learn`).
 
 The results come in the seeds' order and depend on the seeds alone. A seed whose worker dies is run again.
 """

@@ -5,7 +5,7 @@
 >>> observation, info = env.reset(seed=1)
 >>> many = gymnasium.make_vec("companion/Approach-v0", num_envs=256)
 
-`spaces` names what is observed and what acts. It needs the extra `rl`.
+`spaces` names what is observed and what acts. It needs the extra `learn`.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-pytest.importorskip("gymnasium", reason="gymnasium is of the optional extra rl")
+pytest.importorskip("gymnasium", reason="gymnasium is of the optional extra learn")
 
 import gymnasium
 from gymnasium.utils.env_checker import check_env

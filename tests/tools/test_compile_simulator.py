@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("gymnasium", reason="gymnasium is of the optional extra rl")
+pytest.importorskip("gymnasium", reason="gymnasium is of the optional extra learn")
 pytest.importorskip("mypyc", reason="mypyc is of the optional extra dev")
 
 import gymnasium

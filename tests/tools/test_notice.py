@@ -30,7 +30,7 @@ def test_gpl_is_of_the_console_alone() -> None:
         extra: {name for name, text in licences(extras[extra]).items() if text.startswith("GPL")}
         for extra in extras
     }
-    assert {extra: names for extra, names in gpl.items() if names} == {"console": {"aioconsole"}}
+    assert {extra: names for extra, names in gpl.items() if names} == {"service": {"aioconsole"}}
 
 
 def test_unknown_package_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""Alignment of two point clouds by ICP, with `small-gicp` (the extra `cloud`)."""
+"""Alignment of two point clouds by ICP, with `small-gicp` (the extra `cameras`)."""
 
 from __future__ import annotations
 

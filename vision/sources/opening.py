@@ -281,7 +281,7 @@ def _open_csi(uri: str, settings: SourceSettings) -> Source:
     return LatestSource(uri, lambda: CsiCapture(number, wanted), wanted)
 
 
-@source("realsense", "a RealSense depth camera (extra `realsense`)")
+@source("realsense", "a RealSense depth camera (extra `cameras`)")
 def _open_realsense(uri: str, settings: SourceSettings) -> Source:
     module = load_module("pyrealsense2", uri)
     return LatestSource(
@@ -289,7 +289,7 @@ def _open_realsense(uri: str, settings: SourceSettings) -> Source:
     )
 
 
-@source("oak", "an OAK depth camera (extra `oak`)")
+@source("oak", "an OAK depth camera (extra `cameras`)")
 def _open_oak(uri: str, settings: SourceSettings) -> Source:
     module = load_module("depthai", uri)
     return LatestSource(

@@ -129,7 +129,7 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "mcp.server", None)
     result = CliRunner().invoke(app, ["mcp"])
     assert result.exit_code == 2
-    assert "[mcp]" in result.stderr
+    assert "[language]" in result.stderr
 
 
 @pytest.mark.realtime

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-pytest.importorskip("stable_baselines3", reason="stable_baselines3 is of the optional extra rl")
+pytest.importorskip("stable_baselines3", reason="stable_baselines3 is of the optional extra learn")
 
 import torch
 
@@ -242,5 +242,5 @@ def test_missing_extra_is_named_and_help_does_not_need_it(monkeypatch: pytest.Mo
     assert "--algorithm" in shown.stdout
     done = CliRunner().invoke(app, ["train-policy", "companion/CartPole-v0"])
     assert done.exit_code == 2
-    assert "mavlink-companion[rl]" in done.stderr
+    assert "mavlink-companion[learn]" in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -121,7 +121,7 @@ async def test_without_aioconsole_one_line_and_the_service_goes_on(
     await service.run()
     assert not service.stopped
     (line,) = capsys.readouterr().err.splitlines()
-    assert "'mavlink-companion[console]'" in line
+    assert "'mavlink-companion[service]'" in line
 
 
 async def test_sentence_that_fails_leaves_the_console(

@@ -84,7 +84,7 @@ def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.Monkey
     ):
         result = CliRunner().invoke(app, [*command, "--ray", "127.0.0.1:6379"])
         assert result.exit_code == 2
-        assert "mavlink-companion[cluster]" in result.stderr
+        assert "mavlink-companion[learn]" in result.stderr
         assert len(result.stderr.splitlines()) == 1
 
 
@@ -152,7 +152,7 @@ def test_failed_seed_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
 
 def test_address_without_a_cluster_is_refused_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("ray", reason="ray is of the optional extra cluster")
+    pytest.importorskip("ray", reason="ray is of the optional extra learn")
     with socket.socket() as bound:  # not listening: a connection is refused
         bound.bind(("127.0.0.1", 0))
         unused = f"127.0.0.1:{bound.getsockname()[1]}"
@@ -178,7 +178,7 @@ def token() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
     """The address of a Ray cluster of two processors on this machine."""
-    pytest.importorskip("ray", reason="ray is of the optional extra cluster")
+    pytest.importorskip("ray", reason="ray is of the optional extra learn")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -214,7 +214,7 @@ def test_cluster_gives_the_flights_of_one_and_of_two_processes(cluster: str) -> 
 @pytest.mark.timeout(300)
 def test_cluster_trains_the_policies_of_one_and_of_two_processes(cluster: str, tmp_path: Path) -> None:
     trainer = pytest.importorskip(
-        "companion.learning.train_policy", reason="companion.learning.train_policy needs the extra rl"
+        "companion.learning.train_policy", reason="companion.learning.train_policy needs the extra learn"
     )
     trained = {}
     for name, options in (("one", {}), ("two", {"processes": 2}), ("ray", {"ray": cluster})):

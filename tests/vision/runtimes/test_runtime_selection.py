@@ -34,12 +34,18 @@ def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in absent else real(name))
 
 
-@pytest.mark.parametrize("runtime", ["onnxruntime", "openvino", "tensorrt"])
+@pytest.mark.parametrize(
+    ("runtime", "package"),
+    [
+        ("onnxruntime", "onnxruntime$"),
+        ("openvino", r"'mavlink-companion\[models\]'$"),
+        ("tensorrt", r"'mavlink-companion\[nvidia\]'$"),
+    ],
+)
 def test_missing_runtime_names_its_extra(
-    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, runtime: RuntimeName
+    checkpoint: Path, monkeypatch: pytest.MonkeyPatch, runtime: RuntimeName, package: str
 ) -> None:
     only(monkeypatch, "torch")
-    package = "onnxruntime$" if runtime == "onnxruntime" else rf"'mavlink-companion\[{runtime}\]'$"
     with pytest.raises(RuntimeMissingError, match=rf"pip install {package}"):
         Detector(checkpoint, image_size=96, runtime=runtime)
     with pytest.raises(RuntimeMissingError, match=runtime):
@@ -58,7 +64,7 @@ def test_missing_runtime_is_not_measured_nor_the_model_read(
     monkeypatch.setattr(autotune, "_end_with_parent", lambda parent: None)
     only(monkeypatch, "torch")
     assert autotune.main(json.dumps({"parent_pid": 0, "path": "/none.pt", "runtime": "tensorrt"})) == 0
-    assert "mavlink-companion[tensorrt]" in capsys.readouterr().out
+    assert "mavlink-companion[nvidia]" in capsys.readouterr().out
 
 
 def test_broken_runtime_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -289,7 +295,7 @@ def test_measurement_runs_in_a_subprocess(checkpoint: Path) -> None:
     assert isinstance(answer["torch"], float)
     assert answer["torch"] > 0
     if not installed("tensorrt"):
-        assert "mavlink-companion[tensorrt]" in answer["tensorrt"]
+        assert "mavlink-companion[nvidia]" in answer["tensorrt"]
 
 
 def test_version_of_a_runtime_from_another_package(monkeypatch: pytest.MonkeyPatch) -> None:
