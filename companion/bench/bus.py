@@ -117,7 +117,7 @@ async def _detecting(number: int, priority: Priority) -> AsyncIterator[list[int]
         cv2.imwrite(str(image), random_scene(np.random.default_rng(_SCENE_SEED), 640, 480)[0])
         settings = Settings.model_validate(
             {
-                "source": {"uri": str(image), "loop": True, "realtime": False},
+                "source": {"uri": str(image), "loop": True, "every_frame": True},
                 # The size of `companion play`.
                 "detector": {"threads": 1, "image_size": 320, "priority": priority},
             }

@@ -124,7 +124,7 @@ def depth(
     from companion.camera_tools.preview import DepthRecorder, depth_source
     from companion.perception.assembly import CameraTelemetry, build_pipeline, load_detector
 
-    played = settings.source.model_copy(update={"realtime": False})  # every frame of a recording
+    played = settings.source.model_copy(update={"every_frame": True})  # every frame of a recording
     settings = settings.model_copy(update={"source": played})
     with opened(settings, source) as frames, plain_errors(ValueError):
         settings = _with_calibration(settings, frames)

@@ -6,6 +6,8 @@ import ast
 import functools
 import inspect
 import sys
+from collections.abc import Mapping
+from typing import Any, Self
 
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
@@ -21,6 +23,12 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy with changes, whose values are not checked. Raises KeyError for an unknown name."""
+        if unknown := (update or {}).keys() - type(self).model_fields.keys():
+            raise KeyError(f"{type(self).__name__} has no {', '.join(sorted(unknown))}")
+        return super().model_copy(update=update, deep=deep)
 
     @classmethod
     def fields_by_key(cls) -> dict[str, FieldInfo]:

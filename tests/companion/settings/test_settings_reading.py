@@ -328,6 +328,11 @@ def test_settings_are_frozen() -> None:
         Settings().detector.confidence = 0.5
 
 
+def test_copy_with_a_name_that_is_no_setting_is_refused() -> None:
+    with pytest.raises(KeyError, match="realtime"):
+        Settings().source.model_copy(update={"realtime": False})
+
+
 def test_field_of_view_spans_the_frame() -> None:
     model = Settings().camera.model(640, 480)
     assert math.degrees(2 * math.atan(320 / model.fx)) == pytest.approx(80.0)
