@@ -61,7 +61,7 @@ REMOVED = {
         "set detector.rate_hz, the source's rate divided by it; 1 is no limit", _same(1)
     ),
     "detector.max_age_s": Removed(
-        "remove it: guidance.perception_max_age_s limits the age of what is flown by", _same(None)
+        "remove it: guidance.perception_max_age_s limits the age of detections in flight", _same(None)
     ),
     "detector.tile_overlap": Removed("remove it: tiles overlap by 0.2 of their side", _same(0.2)),
     "detector.tile_size": Removed(

@@ -137,7 +137,7 @@ def simulate(
     gusts: Annotated[
         float | None,
         typer.Option(
-            help="Gusts in m/s, standard deviation per axis; 0: none; default: 0.6 and 15 % of --wind."
+            help="Gusts in m/s, standard deviation per axis; 0: none; default: 0.4 and 15 % of --wind."
         ),
     ] = None,
     camera: Annotated[
