@@ -26,6 +26,7 @@ MODULES = (
     "physics/rotor_control.py",
     "physics/rotations.py",
     "physics/estimate_errors.py",
+    "physics/fallible_estimate.py",
     "flight/position_control.py",
 )
 _FUTURE = "from __future__ import annotations\n"

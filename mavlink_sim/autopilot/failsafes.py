@@ -3,173 +3,32 @@
 Every failed check has one action; the worst of all active actions is selected. Most actions first hold the
 position for COM_FAIL_ACT_T seconds, so that a pilot can take over. An action ends with its condition, or only
 with the next change of mode or disarming. The rules are those of PX4 v1.14 to v1.18, which differ where
-`releases` says so. Names in capitals are PX4's
-parameters; times are seconds.
+`releases` says so. Names in capitals are PX4's parameters; times are seconds.
 """
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from enum import Enum, IntEnum
 
+from mavlink_sim.autopilot.failsafe_responses import (
+    UNTIL_MODE_CHANGE,
+    Action,
+    Cause,
+    Clears,
+    Response,
+    Takeover,
+    battery_response,
+    geofence_response,
+    link_loss_response,
+    motor_response,
+)
+from mavlink_sim.autopilot.failsafe_texts import INFO_LEVELS, failsafe_entered, failsafe_event
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode
 from mavlink_sim.px4.parameters import Parameters
 from mavlink_sim.releases import Release, SticksCheck
-from mavlink_sim.wire.announcements import CRITICAL, Text, event_identifier
-
-
-class Action(IntEnum):
-    """The failsafe actions in order of severity; the worst wins. The values are those of PX4's events."""
-
-    NONE = 0
-    WARN = 1
-    FALLBACK_POSITION = 2
-    FALLBACK_ALTITUDE = 3
-    FALLBACK_STABILIZED = 4
-    HOLD = 5
-    RETURN = 6
-    LAND = 7
-    DESCEND = 8
-    DISARM = 9
-    TERMINATE = 10
-
-
-class Cause(IntEnum):
-    """The cause, by PX4's events."""
-
-    GENERIC = 0
-    MANUAL_CONTROL_LOSS = 1
-    GROUND_STATION_LOSS = 2
-    BATTERY_LOW = 3
-    BATTERY_CRITICAL = 4
-    BATTERY_EMERGENCY = 5
-
-
-class Clears(Enum):
-    """What ends an action once its condition is over."""
-
-    WITH_CONDITION = "with its condition"
-    ON_MODE_CHANGE_OR_DISARM = "on a change of mode or on disarming"
-    NEVER = "never"
-
-
-class Takeover(IntEnum):
-    """How a pilot may end an action; the strictest of all active actions applies."""
-
-    ALWAYS = 0
-    MODE_SWITCH_ONLY = 1
-    AFTER_DELAY = 2  # one of the two above, by COM_FAIL_ACT_T
-    NEVER = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Response:
-    """The action of a failed check."""
-
-    action: Action
-    cause: Cause = Cause.GENERIC
-    clears: Clears = Clears.WITH_CONDITION
-    takeover: Takeover = Takeover.AFTER_DELAY
-
-
-UNTIL_MODE_CHANGE = Clears.ON_MODE_CHANGE_OR_DISARM
-
-
-def link_loss_response(value: int, cause: Cause) -> Response:
-    """NAV_RCL_ACT and NAV_DLL_ACT: 1 hold, 2 return, 3 land, 5 terminate, 6 disarm; else nothing."""
-    if value in (1, 2, 3):
-        action = (Action.HOLD, Action.RETURN, Action.LAND)[value - 1]
-        return Response(action, cause, UNTIL_MODE_CHANGE)
-    if value == 5:
-        return Response(Action.TERMINATE, cause, Clears.NEVER, Takeover.NEVER)
-    if value == 6:
-        return Response(Action.DISARM, cause, takeover=Takeover.NEVER)
-    return Response(Action.NONE, cause)
-
-
-def battery_response(value: int, warning: BatteryWarning) -> Response:
-    """COM_LOW_BAT_ACT: 0 warn, 1 return, 2 land, 3 return when critical and land in an emergency."""
-    if warning is BatteryWarning.CRITICAL:
-        action = {1: Action.RETURN, 2: Action.LAND, 3: Action.RETURN}.get(value, Action.WARN)
-        return Response(action, Cause.BATTERY_CRITICAL)
-    if warning is BatteryWarning.EMERGENCY:
-        action = {1: Action.RETURN, 2: Action.LAND, 3: Action.LAND}.get(value, Action.WARN)
-        return Response(action, Cause.BATTERY_EMERGENCY)
-    return Response(Action.WARN, Cause.BATTERY_LOW)
-
-
-def geofence_response(value: int) -> Response:
-    """GF_ACTION and COM_WIND_MAX_ACT: 0 nothing, 1 warn, 2 hold, 3 return, 4 terminate, 5 land."""
-    if value == 2:
-        return Response(Action.HOLD, clears=UNTIL_MODE_CHANGE, takeover=Takeover.MODE_SWITCH_ONLY)
-    if value == 4:
-        return Response(Action.TERMINATE, clears=Clears.NEVER, takeover=Takeover.NEVER)
-    actions = {0: Action.NONE, 3: Action.RETURN, 5: Action.LAND}
-    return Response(actions.get(value, Action.WARN), clears=UNTIL_MODE_CHANGE)
-
-
-def motor_response(value: int) -> Response:
-    """COM_ACT_FAIL_ACT: 0 warn, 1 hold, 2 land, 3 return, 4 terminate."""
-    if value == 4:
-        return Response(Action.TERMINATE, clears=Clears.NEVER)
-    if value == 1:
-        return Response(Action.HOLD)
-    actions = {2: Action.LAND, 3: Action.RETURN}
-    return Response(actions.get(value, Action.WARN), clears=UNTIL_MODE_CHANGE)
-
-
-# Log levels of an EVENT: the lower four bits for ground stations, the upper four for the vehicle's own log.
-INFO_LEVELS = 0x66
-WARNING_LEVELS = 0x44
-CRITICAL_LEVELS = 0x42
-
-
-def failsafe_entered(intended: Mode, action: Action, delayed: Action, cause: Cause, delay_s: float) -> Text:
-    """The text and event of an action that begins.
-
-    Args:
-        delayed: the action that follows `action` in `delay_s` seconds; NONE: no other.
-    """
-    mode = struct.pack("<I", intended.custom_mode)
-    if action is Action.HOLD and delayed is not Action.NONE:
-        seconds = int(delay_s + 0.5)
-        arguments = mode + struct.pack("<BH", delayed, seconds)
-        name = "commander_failsafe_enter_generic_hold"
-        if cause is not Cause.GENERIC:
-            name, arguments = "commander_failsafe_enter_hold", arguments + bytes([cause])
-        text = f"Failsafe activated: entering Hold for {seconds} seconds\t"
-        return _event(name, CRITICAL_LEVELS, arguments, text)
-    text = "" if action is Action.WARN else "Failsafe activated\t"
-    if cause is not Cause.GENERIC:
-        if action is Action.WARN:
-            return _warning(mode, cause)
-        return _event("commander_failsafe_enter", CRITICAL_LEVELS, mode + bytes([action, cause]), text)
-    if action is Action.WARN:
-        return _event("commander_failsafe_enter_generic_warn", WARNING_LEVELS, mode)
-    name = "commander_failsafe_enter_generic"
-    if action in (Action.DESCEND, Action.FALLBACK_ALTITUDE, Action.FALLBACK_STABILIZED):
-        name = "commander_failsafe_enter_autopilot_disengaged"
-    return _event(name, CRITICAL_LEVELS, mode + bytes([action]), text)
-
-
-_BATTERY_WARNINGS = {
-    Cause.BATTERY_LOW: ("commander_failsafe_enter_low_bat", 0x64),
-    Cause.BATTERY_CRITICAL: ("commander_failsafe_enter_crit_bat_warn", 0x62),
-    Cause.BATTERY_EMERGENCY: ("commander_failsafe_enter_crit_low_bat_warn", 0x60),
-}
-
-
-def _warning(mode: bytes, cause: Cause) -> Text:
-    if cause in _BATTERY_WARNINGS:
-        return _event(*_BATTERY_WARNINGS[cause])
-    return _event("commander_failsafe_enter_warn", WARNING_LEVELS, mode + bytes([cause]))
-
-
-def _event(name: str, levels: int, arguments: bytes = b"", text: str = "") -> Text:
-    return Text(CRITICAL, text, (event_identifier(name), levels, arguments))
+from mavlink_sim.wire.announcements import Text
 
 
 @dataclass(slots=True)
@@ -539,7 +398,7 @@ class FailsafeMachine:
                 if sticks_request and not self.user_took_over:
                     intended = Mode.POSCTL
                 if not self.user_took_over:
-                    self._announce(_event("failsafe_rc_override", INFO_LEVELS))
+                    self._announce(failsafe_event("failsafe_rc_override", INFO_LEVELS))
                 took_over, delayed = True, Action.NONE
                 action = max(Action.WARN, self._mode_fallback(conditions, intended))
             action, cause = self._possible(action, cause)

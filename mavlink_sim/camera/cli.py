@@ -15,11 +15,12 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from mavlink_sim.camera.autopilot_link import AutopilotLink
 from mavlink_sim.camera.cli_options import CameraOutputs, CameraRate, CameraTruth, SceneName
 from mavlink_sim.camera.process import OUTPUT_FAILED, CameraProcess
 from mavlink_sim.camera.scene import Scene
 from mavlink_sim.camera.scene_file import scene_or_demo
-from mavlink_sim.camera.vehicle_pose import AutopilotLink, Pose, PoseHistory, Vector
+from mavlink_sim.camera.vehicle_pose import Pose, PoseHistory, Vector
 from mavlink_sim.camera.video_outputs import STANDARD_OUTPUT
 from mavlink_sim.world.truth_file import TruthFile, object_truth
 from vision.attitude import euler_from_quaternion

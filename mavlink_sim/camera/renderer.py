@@ -9,8 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from itertools import pairwise
 
 import cv2
 import numpy as np
@@ -19,223 +17,17 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.ground_view import Buffers, View, add_haze, draw_ground, draw_sky
 from mavlink_sim.camera.image_effects import ImageEffects, Sensor
 from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
+from mavlink_sim.camera.object_painter import Painted, paint_objects
 from mavlink_sim.camera.object_view import (
     FACE_BITS,
-    FAR_PX,
-    NEAR_M,
-    SUBPIXEL_BITS,
     PlacedObject,
     Sighting,
     within_view,
 )
-from mavlink_sim.world.depth_sort import clip_polygon
-from mavlink_sim.world.textures import Image, Plane, fractal_noise
+from mavlink_sim.camera.shadows import Shadows
+from mavlink_sim.world.textures import Image, Plane
 from mavlink_sim.world.world import World, WorldObject, range_to
 from vision.camera_model import CameraModel, CameraMount
-
-MAX_SHADOW_SOLIDS_AT_PX = 14.0
-"""A shadow smaller than this is drawn as one outline, not as one per solid."""
-
-Outlines = tuple[NDArray[np.float64], list[int]]
-"""(P, 2) corners in pixels of all convex outlines, and the start of each and the end of the last."""
-
-
-class Shadows:
-    """The shadows of these objects."""
-
-    def __init__(self, placed: Sequence[PlacedObject]) -> None:
-        self._placed = list(placed)
-        spheres = [_around(item) for item in self._placed]
-        self._middles = np.array([middle for middle, _ in spheres]).reshape(-1, 3)
-        self._radii = np.array([radius_m for _, radius_m in spheres])
-
-    def cast(self, view: View, darkness: float, image: Image) -> None:
-        """Darken the ground of `image` by `darkness`, 0..1, in the objects' shadows."""
-        if darkness <= 0.0:
-            return
-        mask: Image | None = None
-        left, top, right, bottom = view.width, view.height, 0, 0
-        for placed in within_view(self._placed, self._middles, self._radii, view):
-            outlines = _in_view(placed, view)
-            if outlines is None:
-                continue
-            if mask is None:
-                mask = np.zeros((view.height, view.width), np.uint8)
-            points, first = outlines
-            low = np.minimum.reduceat(points, first[:-1])
-            high = np.maximum.reduceat(points, first[:-1])
-            shown = (high >= 0.0).all(axis=1) & (low <= (view.width, view.height)).all(axis=1)
-            if not shown.any():
-                continue
-            left, top = np.minimum((left, top), low[shown].astype(np.int64).min(axis=0)).tolist()
-            right, bottom = np.maximum((right, bottom), high[shown].astype(np.int64).max(axis=0)).tolist()
-            fixed = np.rint(np.clip(points, -FAR_PX, FAR_PX) * (1 << SUBPIXEL_BITS)).astype(np.int32)
-            for index in np.flatnonzero(shown).tolist():
-                outline = fixed[first[index] : first[index + 1]]
-                cv2.fillConvexPoly(mask, outline, 255, cv2.LINE_8, SUBPIXEL_BITS)
-        left, top = max(left - 4, 0), max(top - 4, 0)
-        right, bottom = min(right + 5, view.width), min(bottom + 5, view.height)
-        if mask is None or right <= left or bottom <= top:
-            return
-        soft = cv2.blur(mask[top:bottom, left:right], (5, 5))
-        factor = cv2.cvtColor(255 - cv2.convertScaleAbs(soft, alpha=darkness), cv2.COLOR_GRAY2BGR)
-        part = image[top:bottom, left:right]
-        cv2.multiply(part, factor, dst=part, scale=1 / 255)
-
-
-def _around(placed: PlacedObject) -> tuple[NDArray[np.float64], float]:
-    """Centre (3,) NED and radius in metres of a sphere around a shadow, without its outlines.
-
-    The outlines of moving objects are computed for each frame, only for those that may be in view.
-    """
-    lean = placed.sun[:2] / max(-float(placed.sun[2]), 0.05)
-    height_m = max(max(float(placed.origin[2]), 0.0) - float(placed.middle[2]), 0.0)
-    north_east = placed.middle[:2] - lean * height_m
-    return np.array([*north_east, 0.0]), placed.radius_m * math.hypot(1.0, float(lean[0]), float(lean[1]))
-
-
-def _in_view(placed: PlacedObject, view: View) -> Outlines | None:
-    """A shadow's outlines, clipped at the near plane, one for all where it is small; None if out of view."""
-    corners, first = placed.shadow
-    projected = (corners - view.eye) @ view.pixel_from_ned.T
-    depth = projected[:, 2]
-    if float(depth.max()) < NEAR_M:
-        return None
-    if float(depth.min()) >= NEAR_M:
-        points = projected[:, :2] / projected[:, 2:]
-        low, high = points.min(axis=0), points.max(axis=0)
-        if high[0] < 0 or high[1] < 0 or low[0] > view.width or low[1] > view.height:
-            return None
-        if float((high - low).max()) < MAX_SHADOW_SOLIDS_AT_PX:
-            hull = cv2.convexHull(points.astype(np.float32)).reshape(-1, 2).astype(np.float64)
-            return hull, [0, len(hull)]
-        return points, first
-    forward = np.array([0.0, 0.0, 1.0])
-    cut: list[NDArray[np.float64]] = []
-    ends = [0]
-    for start, end in pairwise(first):
-        piece = projected[start:end]
-        nearest = float(piece[:, 2].min())
-        kept = piece if nearest >= NEAR_M else clip_polygon(piece, forward, NEAR_M)
-        if len(kept) >= 3:
-            cut.append(kept[:, :2] / kept[:, 2:])
-            ends.append(ends[-1] + len(kept))
-    return (np.concatenate(cut), ends) if cut else None
-
-
-_FACE = (1 << FACE_BITS) - 1
-_TEXELS_PER_M = 90.0
-_RIM_PX = 2
-"""Around the objects, where their edges are softened."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Painted:
-    """The objects of an image, in the order of their labels: the first one's number is 1.
-
-    Attributes:
-        objects: each with its pixels without occlusion.
-        labels: (H, W) int32, number << FACE_BITS | face; 0 where there is none.
-        part: rows and columns of the image with all of them and a rim, to index with.
-    """
-
-    objects: list[tuple[PlacedObject, Sighting]]
-    labels: NDArray[np.int32]
-    part: tuple[slice, slice]
-
-
-def paint_objects(seen: list[PlacedObject], view: View, image: Image, inverse_depth: Plane) -> Painted:
-    """Draw objects where they are nearer than the present depth.
-
-    Args:
-        seen: the objects that may be in view.
-        image: (H, W, 3) uint8 BGR, modified.
-        inverse_depth: (H, W) float32, 1/m along the optical axis, 0 in the sky; modified.
-    """
-    labels = np.zeros((view.height, view.width), np.int32)
-    objects: list[tuple[PlacedObject, Sighting]] = []
-    flat_depth, flat_labels = inverse_depth.reshape(-1), labels.reshape(-1)
-    for placed in seen:
-        sighting = placed.draw(view)
-        if sighting is None:
-            continue
-        objects.append((placed, sighting))
-        nearer = sighting.inverse_depth > flat_depth.take(sighting.pixels)
-        pixels = sighting.pixels[nearer]
-        flat_depth[pixels] = sighting.inverse_depth[nearer]
-        flat_labels[pixels] = sighting.faces[nearer] + (len(objects) << FACE_BITS)
-    painted = Painted(objects, labels, _part(objects, view))
-    if objects:
-        _colour(painted, view, image, inverse_depth)
-    return painted
-
-
-def _part(objects: list[tuple[PlacedObject, Sighting]], view: View) -> tuple[slice, slice]:
-    if not objects:
-        return slice(0, 0), slice(0, 0)
-    left = min(sighting.left for _, sighting in objects) - _RIM_PX
-    top = min(sighting.top for _, sighting in objects) - _RIM_PX
-    right = max(sighting.right for _, sighting in objects) + _RIM_PX
-    bottom = max(sighting.bottom for _, sighting in objects) + _RIM_PX
-    return slice(max(top, 0), min(bottom, view.height)), slice(max(left, 0), min(right, view.width))
-
-
-def _colour(painted: Painted, view: View, image: Image, inverse_depth: Plane) -> None:
-    """Give every pixel with an object its face's colour, textured."""
-    rows, columns = painted.part
-    # numpy searches booleans in an eighth of the time of numbers
-    where = np.flatnonzero(painted.labels[rows, columns] != 0)
-    down, right = np.divmod(where, columns.stop - columns.start)
-    down += rows.start
-    right += columns.start
-    pixels = down * view.width + right
-    labels = painted.labels.reshape(-1).take(pixels)
-    number, face = (labels >> FACE_BITS) - 1, labels & _FACE
-    tables = [sighting.face_colours for _, sighting in painted.objects]
-    first = np.cumsum([0, *(len(table) for table in tables[:-1])])
-    colours = np.concatenate(tables).take(first.take(number) + face, axis=0)
-    x, y = right.astype(np.float32), down.astype(np.float32)
-    depth = np.float32(1.0) / inverse_depth.reshape(-1).take(pixels)
-    brightness = _texture([placed for placed, _ in painted.objects], number, view, x, y, depth)
-    for index, (placed, _) in enumerate(painted.objects):
-        if (printed := placed.item.printed) is not None:
-            own = np.flatnonzero(number == index)
-            faces = face[own].astype(np.int64)
-            brightness[own] *= placed.printed_brightness(printed, view, faces, x[own], y[own])
-    colours *= brightness[:, None]
-    np.clip(colours, 0.0, 255.0, out=colours)
-    image.reshape(-1, 3)[pixels] = colours.astype(np.uint8)
-
-
-def _texture(
-    objects: list[PlacedObject], number: NDArray[np.int32], view: View, x: Plane, y: Plane, depth: Plane
-) -> Plane:
-    """(N,) brightness of pixels: darker near the ground, a little mottled, fixed to the object."""
-    scale = np.array([placed.item.scale for placed in objects], np.float32)
-    away = np.array([view.eye[:2] - placed.origin[:2] for placed in objects], np.float32)
-    rays = view.ned_from_pixel.astype(np.float32)
-    above = -(np.float32(view.eye[2]) + depth * (rays[2, 0] * x + rays[2, 1] * y + rays[2, 2]))
-    north = away[:, 0].take(number) + depth * (rays[0, 0] * x + rays[0, 1] * y + rays[0, 2])
-    east = away[:, 1].take(number) + depth * (rays[1, 0] * x + rays[1, 1] * y + rays[1, 2])
-    texels = (np.float32(_TEXELS_PER_M) / scale).take(number)
-    across = ((north + np.float32(0.37) * above) * texels).astype(np.int32) & 255
-    along = ((east + np.float32(0.71) * above) * texels).astype(np.int32) & 255
-    brightness: Plane = _mottle().take((along << 8) + across)
-    above *= (np.float32(1.6) / scale).take(number)
-    np.clip(above, 0.0, 1.0, out=above)
-    above *= np.float32(0.24)
-    above += np.float32(0.76)
-    brightness *= above
-    return brightness
-
-
-@lru_cache(maxsize=1)
-def _mottle() -> Plane:
-    """(65536,) brightness factors around 1: dirt and cloth, a 256 × 256 tile laid flat."""
-    rng = np.random.default_rng(12)
-    tile = 1.0 + 0.03 * fractal_noise(rng, 256, 8, 5, 0.8)
-    return tile.astype(np.float32).ravel()
-
 
 DEFAULT_CAMERA = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
 DEFAULT_MOUNT = CameraMount(forward_m=0.12, pitch_rad=math.radians(-20.0))

@@ -11,7 +11,7 @@ from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.grammar import Fault
 from mavlink_sim.physics.airframe import Multirotor
-from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.fallible_estimate import FallibleEstimate
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.physics.vision_aiding import VisionAiding
 from mavlink_sim.wire.link_faults import LinkStage

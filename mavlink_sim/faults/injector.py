@@ -23,7 +23,8 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, Protocol
 
 from mavlink_sim.faults.schedule import Faults, Outcome
-from mavlink_sim.wire.endpoint import FaultySocket, UdpEndpoint
+from mavlink_sim.wire.endpoint import UdpEndpoint
+from mavlink_sim.wire.faulty_socket import FaultySocket
 
 logger = logging.getLogger(__name__)
 

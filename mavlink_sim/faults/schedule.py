@@ -27,7 +27,7 @@ from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
 from mavlink_sim.faults.link_effects import chosen_links
 from mavlink_sim.faults.message_effects import shifted
-from mavlink_sim.physics.estimate_errors import as_reported
+from mavlink_sim.physics.fallible_estimate import as_reported
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.wire.link_faults import LinkStage
 from mavlink_sim.wire.links import Link

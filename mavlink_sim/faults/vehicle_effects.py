@@ -11,7 +11,7 @@ from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.context import ActiveFault, FaultTarget
 from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.flight.tasks import Trajectory
-from mavlink_sim.physics.estimate_errors import ZERO
+from mavlink_sim.physics.fallible_estimate import ZERO
 from mavlink_sim.physics.rotations import Vector
 from mavlink_sim.px4.modes import Mode, mode_of
 from mavlink_sim.wire.announcements import Text

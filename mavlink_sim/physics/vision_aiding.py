@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 
-from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.fallible_estimate import FallibleEstimate
 from mavlink_sim.px4.parameters import Parameters
 
 HORIZONTAL, VERTICAL, YAW = 1, 2, 8  # bits of EKF2_EV_CTRL

@@ -17,8 +17,9 @@ from mavlink_sim.realtime.sim_outputs import SimOutputs, loaded_scene
 from mavlink_sim.vehicles.firmware import vehicle_class
 from mavlink_sim.vehicles.fleet_world import FleetWorld
 from mavlink_sim.vehicles.vehicle import STEP_S
-from mavlink_sim.wire.endpoint import UdpEndpoint, recording
+from mavlink_sim.wire.endpoint import UdpEndpoint
 from mavlink_sim.wire.streams import GCS_RATES_HZ
+from mavlink_sim.wire.traffic_log import recording
 
 PACE_PERIOD_S = 5.0
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mavlink_sim.autopilot.supervision import NAVIGATION_STATES
+from mavlink_sim.autopilot.health_report import NAVIGATION_STATES
 from mavlink_sim.wire import announcements
 from mavlink_sim.wire.announcements import event_identifier
 

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.flight.position_control import NAN
 from mavlink_sim.physics.airframe import Multirotor
-from mavlink_sim.physics.estimate_errors import FallibleEstimate
+from mavlink_sim.physics.fallible_estimate import FallibleEstimate
 from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Aim, Gimbal, Target
 from mavlink_sim.px4.parameters import Parameters

@@ -11,7 +11,7 @@ from mavlink_sim.missions.items import MissionItem
 from mavlink_sim.missions.navigator import Reached, goes_to_camera
 from mavlink_sim.services import commands
 from mavlink_sim.services.context import ServiceContext
-from mavlink_sim.services.mission_transfer import mission_current
+from mavlink_sim.services.mission_messages import mission_current
 from mavlink_sim.wire.announcements import CRITICAL, Text
 from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link
 from mavlink_sim.wire.messages import Command, dialect

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mavlink_sim.services import gimbal_protocol, kinematics_streams, manual_control_service, system_streams
 from mavlink_sim.services.context import Builder
-from mavlink_sim.services.mission_transfer import mission_current
+from mavlink_sim.services.mission_messages import mission_current
 from mavlink_sim.services.vehicle_files import metadata_message
 from mavlink_sim.wire.messages import dialect
 

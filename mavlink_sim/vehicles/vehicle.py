@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any
 from mavlink_sim.autopilot.commander import Autopilot
 from mavlink_sim.faults.schedule import Faults
 from mavlink_sim.flight.transmitter import Transmitter
-from mavlink_sim.physics.airframe import GUST_STEP_S, GUST_TIME_CONSTANT_S, Multirotor
+from mavlink_sim.physics.airframe import Multirotor
 from mavlink_sim.physics.contact import HARD_LANDING_MPS, Collision
-from mavlink_sim.physics.estimate_errors import FallibleEstimate
-from mavlink_sim.physics.gaussian import BITS, NORMAL
+from mavlink_sim.physics.fallible_estimate import FallibleEstimate
 from mavlink_sim.physics.geography import LocalFrame
 from mavlink_sim.physics.gimbal import Gimbal
 from mavlink_sim.physics.rotations import Vector
@@ -34,6 +33,7 @@ from mavlink_sim.services.event_protocol import EventBuffer
 from mavlink_sim.services.gimbal_protocol import GimbalManager
 from mavlink_sim.services.microservices import HANDLERS
 from mavlink_sim.services.vehicle_files import vehicle_files
+from mavlink_sim.vehicles.wind_model import WindModel
 from mavlink_sim.wire.announcements import CRITICAL, INFO, Text
 from mavlink_sim.wire.links import AUTOPILOT_COMPONENT, Link, forward, target_of
 from mavlink_sim.wire.messages import Outgoing, dialect, link_node_status
@@ -45,38 +45,6 @@ if TYPE_CHECKING:
     from mavlink_sim.camera.scene import Scene
     from mavlink_sim.vehicles.collision_world import CollisionWorld
     from mavlink_sim.world.world import World
-
-
-GUST_STEP_US = round(GUST_STEP_S * 1e6)
-_KEEP = 1.0 - GUST_STEP_S / GUST_TIME_CONSTANT_S
-
-
-class WindModel:
-    """The gusts of one seed.
-
-    Args:
-        seed: the same for all vehicles of a fleet.
-        gusts_mps: standard deviation per axis.
-    """
-
-    def __init__(self, seed: int, gusts_mps: float) -> None:
-        self._bits = random.Random(f"air {seed}").getrandbits
-        self._spread = gusts_mps * math.sqrt(1.0 - _KEEP * _KEEP)
-        self._gust: Vector = (0.0, 0.0, 0.0)
-        self._next_us = 0
-
-    def gust_at(self, time_us: int) -> Vector:
-        """NED m/s at a simulated time; times may only grow."""
-        bits, spread = self._bits, self._spread
-        while self._next_us <= time_us:
-            self._next_us += GUST_STEP_US
-            north, east, down = self._gust
-            self._gust = (
-                _KEEP * north + spread * NORMAL[bits(BITS)],
-                _KEEP * east + spread * NORMAL[bits(BITS)],
-                _KEEP * down + spread * NORMAL[bits(BITS)],
-            )
-        return self._gust
 
 
 # UTC at the boot of a stepped vehicle: midnight of the day its PX4 was built.

@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 
 from mavlink_sim.camera import cli
-from mavlink_sim.camera.vehicle_pose import AutopilotLink, LinkError
+from mavlink_sim.camera.autopilot_link import AutopilotLink, LinkError
 from mavlink_sim.cli.main import main
 from mavlink_sim.testing import free_port, vehicle
 from mavlink_sim.wire.endpoint import UdpEndpoint

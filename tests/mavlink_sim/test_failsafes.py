@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mavlink_sim.autopilot.failsafes import Action, Conditions, FailsafeMachine
+from mavlink_sim.autopilot.failsafe_responses import Action
+from mavlink_sim.autopilot.failsafes import Conditions, FailsafeMachine
 from mavlink_sim.flight.transmitter import Sticks
 from mavlink_sim.physics.battery import BatteryWarning
 from mavlink_sim.px4.modes import Mode

@@ -13,7 +13,7 @@ import zenoh
 from mavlink_sim.faults.injector import ControlError, FaultControl
 from mavlink_sim.testing import free_port, running_simulator
 from mavlink_sim.vehicles.vehicle import Vehicle
-from mavlink_sim.wire.endpoint import FaultySocket
+from mavlink_sim.wire.faulty_socket import FaultySocket
 from mavlink_sim.wire.link_faults import Delay, LinkStage, Loss
 from mavlink_sim.wire.messages import dialect, parser
 

@@ -18,7 +18,8 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from mavlink_sim.camera.process import SLOTS, CameraProcess, SharedPoses
+from mavlink_sim.camera.aircraft_poses import SLOTS, SharedPoses
+from mavlink_sim.camera.process import CameraProcess
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.scene import Path as Way

@@ -11,7 +11,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mavlink_sim.missions.items import ItemRejectedError, PlanType, item_of, message_of
-from mavlink_sim.services.mission_transfer import MissionCurrent
+from mavlink_sim.services.mission_messages import MissionCurrent
 from mavlink_sim.wire.messages import dialect, parser
 from tests.mavlink_sim.conftest import SimHarness
 from tests.mavlink_sim.plan_client import (

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from mavlink_sim.camera.scene import Path
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.mesh import Mesh, mesh_of
-from mavlink_sim.world.obstacles import SECTORS, Obstacles, nearest_in_sectors
+from mavlink_sim.world.obstacles import Obstacles
+from mavlink_sim.world.sectors import SECTORS, nearest_in_sectors
 from mavlink_sim.world.world import Vector, WorldObject
 
 RADIUS_M, HALF_HEIGHT_M = 0.3, 0.12

@@ -23,8 +23,9 @@ from pymavlink import mavutil
 from mavlink_sim.cli.main import main
 from mavlink_sim.realtime.fleet import Fleet
 from mavlink_sim.testing import free_port, free_udp_ports, running_simulator
-from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, TrafficLog, UdpEndpoint, recording
+from mavlink_sim.wire.endpoint import PEER_SILENCE_S, PortInUseError, UdpEndpoint
 from mavlink_sim.wire.messages import Outgoing, dialect, parser
+from mavlink_sim.wire.traffic_log import TrafficLog, recording
 from mavlink_sim.world.truth_file import TruthFile
 from vision.shared_frame import SharedFrameReader, segment_path
 

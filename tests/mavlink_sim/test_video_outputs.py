@@ -19,15 +19,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mavlink_sim.camera.video_outputs import (
-    MAX_CLIENTS,
-    FrameOutput,
-    MjpegOutput,
-    NewestFrame,
-    PipeOutput,
-    check_output,
-    open_output,
-)
+from mavlink_sim.camera.mjpeg_output import MAX_CLIENTS, MjpegOutput
+from mavlink_sim.camera.newest_frame import NewestFrame
+from mavlink_sim.camera.pipe_output import PipeOutput
+from mavlink_sim.camera.video_outputs import FrameOutput, check_output, open_output
 from mavlink_sim.testing import free_port
 from vision.frame import Frame
 from vision.sources import open_source

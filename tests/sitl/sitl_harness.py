@@ -26,7 +26,7 @@ import zenoh
 
 from companion.bus.client import listen, send_command
 from companion.vehicle.link_url import LinkScheme, LinkUrl
-from mavlink_sim.camera.vehicle_pose import AutopilotLink as TruthLink
+from mavlink_sim.camera.autopilot_link import AutopilotLink as TruthLink
 from mavlink_sim.camera.vehicle_pose import Pose as TruePose
 from mavlink_sim.camera.vehicle_pose import PoseHistory
 from mavlink_sim.testing import free_port

@@ -35,8 +35,8 @@ from mavlink_sim.services.microservices import acknowledge
 from mavlink_sim.vehicles.ardupilot import streams
 from mavlink_sim.vehicles.ardupilot.autopilot import FAILED
 from mavlink_sim.vehicles.ardupilot.context import CopterContext
-from mavlink_sim.vehicles.ardupilot.guided import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.vehicles.ardupilot.modes import CopterMode, mode_of
+from mavlink_sim.vehicles.ardupilot.targets import GLOBAL_RELATIVE_ALT, GLOBAL_TERRAIN_ALT, GuidedTarget
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import Command, command_of, dialect
 

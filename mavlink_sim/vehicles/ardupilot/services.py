@@ -14,10 +14,7 @@ from mavlink_sim.services import manual_control_service, microservices
 from mavlink_sim.services.parameter_protocol import text_of
 from mavlink_sim.vehicles.ardupilot import commands, landing, streams
 from mavlink_sim.vehicles.ardupilot.context import CopterContext
-from mavlink_sim.vehicles.ardupilot.guided import (
-    global_target,
-    local_target,
-)
+from mavlink_sim.vehicles.ardupilot.targets import global_target, local_target
 from mavlink_sim.wire.announcements import INFO
 from mavlink_sim.wire.links import Link
 from mavlink_sim.wire.messages import dialect
