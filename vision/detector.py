@@ -35,9 +35,9 @@ from vision.runtimes.selection import RuntimeChoice, check_runtime, check_runtim
 from vision.runtimes.source import ModelSource, check_model_file, read_source
 from vision.runtimes.stored_choice import forget_choices
 from vision.weights import DEFAULT_EXPORT, DEFAULT_WEIGHTS
+from vision.yolo.checkpoint_error import CheckpointError
 from vision.yolo.checkpoint_pair import weights_sha256
 from vision.yolo.postprocess import Boxes, boxes_from, candidates_of, decode_ltrb
-from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
     from vision.yolo.description import ModelDescription

@@ -67,7 +67,7 @@ def evaluate(
     from vision.evaluation.datasets import DatasetError, open_dataset
     from vision.pipeline import FrameDetector
     from vision.tiling import TiledDetector
-    from vision.yolo.safe_pickle import CheckpointError
+    from vision.yolo.checkpoint_error import CheckpointError
 
     log_to_standard_error(logging.INFO, "%(message)s")
     with plain_errors(CheckpointError, DatasetError, ValueError, OSError):

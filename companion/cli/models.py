@@ -68,7 +68,7 @@ def info(
     from vision.detector import model_path
     from vision.runtimes.selection import check_runtime_name
     from vision.runtimes.source import read_source
-    from vision.yolo.safe_pickle import CheckpointError
+    from vision.yolo.checkpoint_error import CheckpointError
 
     with plain_errors(CheckpointError, ValueError):
         check_runtime_name(runtime)
@@ -169,7 +169,7 @@ def verify(
     from companion.models.verify import parity_lines, sample_images, verify
     from vision.model_files import find_model
     from vision.runtimes.base import RuntimeUnusableError
-    from vision.yolo.safe_pickle import CheckpointError
+    from vision.yolo.checkpoint_error import CheckpointError
 
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
         samples = sample_images(images, count)

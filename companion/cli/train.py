@@ -71,7 +71,7 @@ def train(
     Trains it on labelled images (--data), or the default one on rendered scenes.
     """
     from companion.learning.train import score_lines, train_default, train_on_data
-    from vision.yolo.safe_pickle import CheckpointError
+    from vision.yolo.checkpoint_error import CheckpointError
 
     log_to_standard_error(logging.INFO, "%(message)s")
     common = _given(seed=seed, steps=steps, workers=workers, threads=threads)

@@ -37,3 +37,9 @@ def no_proxy(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in getproxies():
         monkeypatch.delenv(f"{name}_proxy", raising=False)
         monkeypatch.delenv(f"{name.upper()}_PROXY", raising=False)
+
+
+@pytest.fixture
+def untried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Checkpoints are read at once, without the trial in another process that takes seconds."""
+    monkeypatch.setattr("vision.yolo.checkpoint_file.check_load", lambda path, runtime: None)

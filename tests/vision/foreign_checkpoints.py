@@ -165,7 +165,7 @@ class Mentioning(pickle._Pickler):
 def archive(path: Path, pickled: bytes, members: dict[str, bytes] | None = None) -> Path:
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("model/data.pkl", pickled)
-        for name, data in (members or {"version": b"3\n"}).items():
+        for name, data in ({"version": b"3\n"} | (members or {})).items():
             file.writestr(f"model/{name}", data)
     return path
 

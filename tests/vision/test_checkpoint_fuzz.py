@@ -210,6 +210,7 @@ OPCODES = st.sampled_from(
 )
 
 
+@pytest.mark.usefixtures("untried")
 @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(OPCODES, max_size=40))
 def test_any_pickle_program_gives_a_model_or_an_error(tmp_path: Path, program: list[bytes]) -> None:

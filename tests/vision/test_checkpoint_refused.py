@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import collections
-import contextlib
-import copy
 import pickle
-import struct
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from torch import Tensor
+from torch.torch_version import TorchVersion
 
 from tests.vision.foreign_checkpoints import (
     FOREIGN,
@@ -38,7 +38,8 @@ from vision.yolo.checkpoint import (
     save_checkpoint,
 )
 from vision.yolo.published import yolov8_description
-from vision.yolo.safe_pickle import unpickle
+
+pytestmark = pytest.mark.usefixtures("untried")
 
 
 def hostile(marker: Path) -> dict[str, Any]:
@@ -88,61 +89,32 @@ def test_hidden_call_in_a_checkpoint_is_not_run(tmp_path: Path, foreign: Classes
 
 
 @pytest.mark.parametrize(
-    ("program", "refused"),
+    "program",
     [
+        pytest.param(b"ctorch.nn.modules.conv\nConv2d\n}b", id="state set on a class"),
+        pytest.param(b"ccollections\nOrderedDict\n}b", id="state set on a type"),
+        pytest.param(b"ctorch._utils\n_rebuild_parameter\n)\x81", id="an instance of a function"),
+        pytest.param(b"X\x01\x00\x00\x00a)R", id="a text is called"),
+        pytest.param(b"ctorch.nn.modules.conv\nConv2d\n)\x81)R", id="a record is called"),
+        pytest.param(b"]}b", id="state set on a list"),
+        pytest.param(b"cdill._dill\n_load_type\nX\x04\x00\x00\x00type\x85R", id="a type by name"),
+        pytest.param(b"cdill._dill\n_load_type\n]\x85R", id="a type by no name"),
         pytest.param(
-            b"\x80\x02ctorch.nn.modules.conv\nConv2d\n}b.", "sets .*AllowedGlobal", id="state set on a class"
-        ),
-        pytest.param(
-            b"\x80\x02ccollections\nOrderedDict\n}b.", "sets .*AllowedGlobal", id="state set on a type"
-        ),
-        pytest.param(
-            b"\x80\x02ccollections\nOrderedDict\n)\x81.",
-            r"instance .*collections\.OrderedDict",
-            id="an instance of a function",
-        ),
-        pytest.param(b"\x80\x02X\x01\x00\x00\x00a)R.", "calls .*str", id="a text is called"),
-        pytest.param(
-            b"\x80\x02ctorch.nn.modules.conv\nConv2d\n)\x81)R.", "calls .*Stub", id="a record is called"
-        ),
-        pytest.param(b"\x80\x02]}b.", "sets .*list", id="state set on a list"),
-        pytest.param(
-            b"\x80\x02ccollections\nOrderedDict\n]\x85R.",
-            "ordered dictionary",
-            id="a dictionary filled by a call",
-        ),
-        pytest.param(
-            b"\x80\x02ccollections\ndefaultdict\n]\x85R.",
-            "default dictionary",
-            id="a default dictionary, filled",
-        ),
-        pytest.param(
-            b"\x80\x02cdill._dill\n_load_type\nX\x04\x00\x00\x00type\x85R.",
-            r"type \('type',\)",
-            id="a type by name",
-        ),
-        pytest.param(b"\x80\x02cdill._dill\n_load_type\n]\x85R.", r"type \(\[\],\)", id="a type by no name"),
-        pytest.param(
-            b"\x80\x02c__builtin__\ngetattr\nctorch.nn.modules.conv\nConv2d\n)\x81"
-            b"X\x09\x00\x00\x00__class__\x86R.",
-            "getattr",
+            b"c__builtin__\ngetattr\nctorch.nn.modules.conv\nConv2d\n)\x81X\x09\x00\x00\x00__class__\x86R",
             id="another method than the folded layer's own",
         ),
         pytest.param(
-            b"\x80\x02c__builtin__\ngetattr\nctorch.nn.modules.conv\nConv2d\n"
-            b"X\x0c\x00\x00\x00forward_fuse\x86R.",
-            "getattr",
+            b"c__builtin__\ngetattr\nctorch.nn.modules.conv\nConv2d\nX\x0c\x00\x00\x00forward_fuse\x86R",
             id="a method of something else than a layer",
         ),
     ],
 )
-def test_misuse_of_allowed_names_is_rejected(tmp_path: Path, program: bytes, refused: str) -> None:
-    with pytest.raises(UnsafeCheckpointError, match=rf"{refused}.*; nothing was run"):
-        load_checkpoint(archive(tmp_path / "evil.pt", program))
-
-
-def tensor_call(*arguments: Any) -> Any:
-    return [Global("torch._utils", "_rebuild_tensor_v2"), arguments]
+def test_misuse_of_allowed_names_is_rejected(tmp_path: Path, program: bytes) -> None:
+    path = archive(tmp_path / "evil.pt", b"\x80\x02}X\x05\x00\x00\x00model" + program + b"s.")
+    with pytest.raises(CheckpointError, match=r"nothing was run|damaged") as caught:
+        load_checkpoint(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).isprintable()
 
 
 def storage(kind: str = "FloatStorage", key: str = "0", count: int = 4) -> Any:
@@ -150,46 +122,74 @@ def storage(kind: str = "FloatStorage", key: str = "0", count: int = 4) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
+    "arguments",
     [
-        pytest.param((storage(), 0, (5,), (1,)), "than its storage", id="too long"),
-        pytest.param((storage(), 1, (4,), (1,)), "than its storage", id="offset too far"),
-        pytest.param((storage(), -1, (1,), (1,)), "impossible shape", id="before the storage"),
-        pytest.param((storage(), 0, (2,), (-1,)), "impossible shape", id="backwards"),
-        pytest.param((storage(), 0, (10**9,), (0,)), "than its storage", id="one number repeated"),
-        pytest.param((storage(), 0, (2, 2), (1,)), "impossible shape", id="a stride missing"),
-        pytest.param((storage(), 0, (True,), (1,)), "impossible shape", id="a size that is no number"),
-        pytest.param((storage(), 0), "without a shape", id="no shape"),
-        pytest.param(((1, 2), 0, (1,), (1,)), "impossible shape", id="no storage"),
-        pytest.param((storage(count=5), 0, (1,), (1,)), "should have 5 numbers", id="storage too short"),
-        pytest.param((storage(count=10**15), 0, (1,), (1,)), "should have", id="a storage without end"),
-        pytest.param((storage(key="7"), 0, (1,), (1,)), "'7' is missing", id="storage missing"),
-        pytest.param((storage(key="../version"), 0, (1,), (1,)), "is missing", id="another member"),
-        pytest.param((storage(kind="Generator"), 0, (1,), (1,)), "torch.Generator", id="another kind"),
+        pytest.param((storage(), 0, (5,), (1,)), id="too long"),
+        pytest.param((storage(), 1, (4,), (1,)), id="offset too far"),
+        pytest.param((storage(), -1, (1,), (1,)), id="before the storage"),
+        pytest.param((storage(), 0, (2,), (-1,)), id="backwards"),
+        pytest.param((storage(), 0, (2, 2), (1,)), id="a stride missing"),
+        pytest.param((storage(), 0), id="no shape"),
+        pytest.param(((1, 2), 0, (1,), (1,)), id="no storage"),
+        pytest.param((storage(count=5), 0, (1,), (1,)), id="storage too short"),
+        pytest.param((storage(count=10**15), 0, (1,), (1,)), id="a storage without end"),
+        pytest.param((storage(key="7"), 0, (1,), (1,)), id="storage missing"),
+        pytest.param((storage(key="../version"), 0, (1,), (1,)), id="another member"),
+        pytest.param((storage(kind="Generator"), 0, (1,), (1,)), id="another kind"),
     ],
 )
-def test_a_tensor_outside_its_storage_is_rejected(
-    tmp_path: Path, arguments: tuple[Any, ...], expected: str
-) -> None:
-    function, call = tensor_call(*arguments)
-    pickled = dumped((function, call))[:-1]
+def test_a_tensor_outside_its_storage_is_rejected(tmp_path: Path, arguments: tuple[Any, ...]) -> None:
+    pickled = dumped((Global("torch._utils", "_rebuild_tensor_v2"), (*arguments, False, {})))[:-1]
     # Unpack the pair and call it: TUPLE2 at the end becomes REDUCE.
     assert pickled.endswith(b"\x86q" + pickled[-1:])
-    program = pickled[:-3] + b"R."
-    path = archive(tmp_path / "t.pt", program, {"data/0": bytes(16), "version": b"3"})
+    path = archive(tmp_path / "t.pt", pickled[:-3] + b"R.", {"data/0": bytes(16)})
+    with pytest.raises(CheckpointError, match=r"damaged|nothing was run"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda: torch.zeros(2).to_sparse(), "not a tensor of numbers"),
+        (lambda: torch.zeros(2, device="meta"), "not a tensor of numbers"),
+        (lambda: torch.quantize_per_tensor(torch.zeros(2), 1.0, 0, torch.qint8), "not a tensor of numbers"),
+        (lambda: torch.zeros(1).expand(10**12), "same numbers"),
+    ],
+    ids=["sparse", "without numbers", "quantized", "one number repeated"],
+)
+def test_weight_that_is_no_plain_array_is_rejected(
+    tmp_path: Path, make: Callable[[], Tensor], expected: str
+) -> None:
+    description = yolov8_description((0.1, 0.01, 64), NAMES).to_plain()
+    content = {"format": FORMAT, "description": description, "state_dict": {"a": make()}, "metadata": {}}
+    torch.save(content, tmp_path / "m.pt")
     with pytest.raises(CheckpointError, match=expected):
-        load_checkpoint(path)
+        load_checkpoint(tmp_path / "m.pt")
 
 
-def test_endlessly_repeated_numbers_are_rejected(tmp_path: Path) -> None:
-    function, call = tensor_call(storage(count=1000), 0, (1000,), (1,))
-    one = dumped((function, call))[2:-1]
-    program = b"\x80\x02](" + (one[:-3] + b"R") * 2000 + b"e."
-    path = archive(tmp_path / "t.pt", program, {"data/0": bytes(4000)})
-    size = path.stat().st_size
-    with pytest.raises(CheckpointError, match="same numbers"):
-        load_checkpoint(path)
-    assert 1000 * 2000 > 4 * size
+def test_torch_whose_reader_runs_code_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """CVE-2026-24747."""
+    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={})
+    monkeypatch.setattr(torch, "__version__", TorchVersion("2.9.1+cpu"))
+    with pytest.raises(CheckpointError, match=r"torch 2\.10 .* 2\.9\.1"):
+        load_checkpoint(tmp_path / "m.pt")
+
+
+def test_strides_that_repeat_one_number_cost_no_memory(tmp_path: Path, foreign: Classes) -> None:
+    whole = as_foreign(trained_model(), foreign)
+    for strides in (torch.zeros(1).expand(10**12), torch.zeros(1, 1).expand(10**6, 10**6)):
+        whole.model[-1].stride = strides
+        with pytest.raises(CheckpointError, match="has strides"):
+            load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
+
+
+def test_text_that_is_no_unicode_is_printable(tmp_path: Path) -> None:
+    save_checkpoint(tmp_path / "m.pt", trained_model(), metadata={"licence": "LICENCE"})
+    with zipfile.ZipFile(tmp_path / "m.pt") as file:
+        members = {name.partition("/")[2]: file.read(name) for name in file.namelist()}
+    pickled = members.pop("data.pkl").replace(b"LICENCE", b"LIC\xed\xa0\x80E")
+    loaded = load_checkpoint(archive(tmp_path / "m.pt", pickled, members))
+    assert loaded.metadata["licence"].isprintable()
 
 
 def test_a_network_larger_than_its_file_costs_no_memory(tmp_path: Path) -> None:
@@ -266,28 +266,10 @@ def test_an_archive_without_a_model_is_rejected(tmp_path: Path) -> None:
             load_checkpoint(tmp_path / "x.pt")
 
 
-def test_two_members_that_share_their_bytes_are_rejected(tmp_path: Path) -> None:
-    """Overlapping members make a small file large."""
-    path = tmp_path / "overlap.pt"
-    with zipfile.ZipFile(path, "w") as file:
-        file.writestr("model/data.pkl", bytes(5000))
-        for number in range(20):
-            info = copy.copy(file.filelist[0])
-            info.filename = f"model/data/{number}"
-            file.filelist.append(info)
-    with pytest.raises(CheckpointError, match=r"members .*larger .*file;"):
-        load_checkpoint(path)
-
-
 def test_a_program_for_torchscript_is_rejected_as_such(tmp_path: Path) -> None:
-    path = archive(tmp_path / "s.pt", dumped({}), {"code/__torch__.py": b""})
+    path = archive(tmp_path / "s.pt", dumped({}), {"constants.pkl": b""})
     with pytest.raises(CheckpointError, match="TorchScript"):
         load_checkpoint(path)
-
-
-def test_numbers_of_the_other_byte_order_are_rejected(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="big-endian"):
-        load_checkpoint(archive(tmp_path / "b.pt", dumped({}), {"byteorder": b"big"}))
 
 
 @pytest.fixture(scope="module")
@@ -376,57 +358,12 @@ def test_a_pickle_with_changed_bytes_loads_or_is_rejected(
     loads_or_names_the_reason(archive(tmp_path / "changed.pt", bytes(changed), members))
 
 
-@settings(max_examples=300, deadline=None)
+@settings(UNHURRIED, max_examples=300)
 @given(program=st.binary(max_size=60))
-def test_any_bytes_are_a_value_or_a_named_error(program: bytes) -> None:
-    with contextlib.suppress(CheckpointError):
-        unpickle(b"\x80\x02" + program, {}, lambda identity: None)
-
-
-def refuse(identity: tuple[Any, ...]) -> Any:
-    raise AssertionError(f"no storage was expected, got {identity}")
-
-
-@pytest.mark.parametrize(
-    "value",
-    [
-        None,
-        [1, 255, 256, 65536, -1, 2**40, -(2**100), 0.5, True, False, "ä", "", ()],
-        {"a": (1,), "b": (1, 2), "c": (1, 2, 3), "d": (1, 2, 3, 4), 5: []},
-        [[]] * 3,
-    ],
-    ids=str,
-)
-def test_plain_values_are_read_as_python_reads_them(value: Any) -> None:
-    assert unpickle(pickle.dumps(value, protocol=2), {}, refuse) == value
-
-
-@pytest.mark.parametrize(
-    ("program", "expected"),
-    [
-        (b"\x80\x04N.", "protocol 2"),
-        (b"\x80\x02\x80\x02N.", "twice"),
-        (b"\x80\x02NN.", "left over"),
-        (b"\x80\x02.", "not there"),
-        (b"\x80\x02e.", "no mark"),
-        (b"\x80\x02(s.", "not there"),
-        (b"\x80\x02h\x05.", "asks for value 5"),
-        (b"\x80\x02}(Nu.", "without a value"),
-        (b"\x80\x02}]Ns.", "type list"),
-        (b"\x80\x02X\x01\x00\x00\x00\xff.", "not UTF-8"),
-        (b"\x80\x02X" + struct.pack("<I", 2**32 - 1) + b"a", "in the middle"),
-        (b"\x80\x02cno end", "without a name"),
-        (b"\x80\x02V1\n.", "opcode b'V'"),
-        (b"\x80\x02NQ.", "than a tuple"),
-    ],
-)
-def test_invalid_pickle_program_is_rejected(program: bytes, expected: str) -> None:
-    with pytest.raises(CheckpointError, match=expected):
-        unpickle(program, {}, refuse)
-
-
-def test_a_huge_memo_number_costs_no_memory() -> None:
-    assert unpickle(b"\x80\x02Nr\xff\xff\xff\xff.", {}, refuse) is None
+def test_any_bytes_as_pickle_are_rejected(tmp_path: Path, program: bytes) -> None:
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(archive(tmp_path / "any.pt", b"\x80\x02" + program))
+    assert str(caught.value).isprintable()
 
 
 def test_an_ordered_dictionary_becomes_a_plain_one(tmp_path: Path) -> None:

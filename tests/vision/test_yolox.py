@@ -88,7 +88,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ({"head.other": torch.zeros(1)}, "1 unknown"),
         ({"head.obj_preds.0.bias": torch.zeros(2)}, "should be"),
         ({"head.obj_preds.0.bias": torch.tensor([float("nan")])}, "not finite"),
-        ({"head.obj_preds.0.bias": 5}, "something else than a tensor"),
+        ({"head.obj_preds.0.bias": 5}, "not a tensor of numbers"),
         ({"backbone.backbone.stem.conv.conv.weight": torch.zeros(9999, 1, 1, 1)}, "its stem"),
     ],
 )

@@ -17,9 +17,9 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from vision.foreign.class_names import NamesError, names_beside
 from vision.foreign.layouts import YOLOX_STRIDES, ForeignFacts, Pixels
-from vision.yolo.checkpoint import check_storages
-from vision.yolo.safe_pickle import CheckpointError, one_line, shown
-from vision.yolo.torch_archive import read_archive
+from vision.yolo.checkpoint import check_weights
+from vision.yolo.checkpoint_error import CheckpointError, one_line
+from vision.yolo.checkpoint_file import read_archive
 
 # Of the authors' training; torch's default is 1e-5.
 _EPSILON = 1e-3
@@ -264,13 +264,8 @@ def load_yolox(path: Path) -> tuple[Yolox, ForeignFacts] | None:
     return model, facts
 
 
-def _with_weights(weights: Mapping[object, object]) -> Yolox:
-    tensors: dict[str, Tensor] = {}
-    for name, tensor in weights.items():
-        if not isinstance(name, str) or not isinstance(tensor, Tensor):
-            raise CheckpointError(f"has something else than a tensor under {shown(name)}")
-        tensors[name] = tensor
-    check_storages(tensors)
+def _with_weights(tensors: dict[str, Tensor]) -> Yolox:
+    check_weights(tensors)
     with torch.device("meta"):
         model = Yolox(_shape_of(tensors))
     expected = model.state_dict()

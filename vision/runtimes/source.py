@@ -21,9 +21,9 @@ from vision.runtimes.base import (
     required,
 )
 from vision.runtimes.exported import SUFFIXES, ExportedFacts, ExportKind, kind_of
+from vision.yolo.checkpoint_error import CheckpointError
 from vision.yolo.checkpoint_pair import is_pair, pair_paths
 from vision.yolo.level_outputs import Head
-from vision.yolo.safe_pickle import CheckpointError
 
 if TYPE_CHECKING:
     from vision.yolo.architecture import YoloModel

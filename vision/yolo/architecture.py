@@ -8,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from vision.yolo.checkpoint_error import shown
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
 from vision.yolo.gelan import CBFuse, RepConv
 from vision.yolo.heads import Detect
 from vision.yolo.layer_config import HEADS, LAYERS, build_layer
 from vision.yolo.layers import ACTIVATIONS, Concat, Conv, LargeKernelDWConv
-from vision.yolo.safe_pickle import shown
 
 __all__ = ["ArchitectureError", "LayerSpec", "ModelDescription", "YoloModel", "build", "build_shapes"]
 

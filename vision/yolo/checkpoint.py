@@ -25,6 +25,8 @@ from vision.foreign.layouts import TASKS
 from vision.plain_yaml import numbered
 from vision.runtimes.exported import kind_of
 from vision.yolo.architecture import ArchitectureError, YoloModel, build_shapes
+from vision.yolo.checkpoint_error import CheckpointError, UnsafeCheckpointError, one_line, shown
+from vision.yolo.checkpoint_file import read_archive
 from vision.yolo.checkpoint_pair import WEIGHTS_SUFFIX, is_pair, read_pair, write_pair
 from vision.yolo.description import (
     A2C2F_DEFAULTS,
@@ -34,8 +36,7 @@ from vision.yolo.description import (
     LayerSpec,
     ModelDescription,
 )
-from vision.yolo.safe_pickle import CheckpointError, Stub, UnsafeCheckpointError, one_line, shown
-from vision.yolo.torch_archive import read_archive
+from vision.yolo.torch_archive import Stub
 
 __all__ = [
     "FORMAT",
@@ -139,8 +140,11 @@ def load_checkpoint(path: str | Path) -> LoadedModel:
     except (CheckpointError, ArchitectureError) as error:
         kind = type(error) if isinstance(error, CheckpointError) else CheckpointError
         raise kind(one_line(f"{path}: {error}")) from None
-    except RecursionError:
-        raise CheckpointError(one_line(f"{path}: its values are nested too deeply")) from None
+    # Of values nested too deeply, and of tensors of an unusual kind.
+    except (AttributeError, RuntimeError, TypeError) as error:
+        raise CheckpointError(
+            one_line(f"{path}: holds values that no checkpoint has ({type(error).__name__}: {error!s:.200})")
+        ) from None
 
 
 def _interpret(content: Any) -> LoadedModel:
@@ -163,10 +167,8 @@ def _from_description(content: dict[Any, Any]) -> LoadedModel:
     """Build a network from `description`, `state_dict` and `metadata`."""
     description = ModelDescription.from_plain(_plain_dictionary(content, "description"))
     weights = content.get("state_dict")
-    if not isinstance(weights, dict) or not all(isinstance(value, Tensor) for value in weights.values()):
+    if not isinstance(weights, dict):
         raise CheckpointError("has no state_dict of tensors")
-    for name in weights:
-        _check_name(name)
     model = _with_weights(description, weights)
     return LoadedModel(model, description.class_names, description, _plain_dictionary(content, "metadata"))
 
@@ -183,9 +185,11 @@ def _interpret_ultralytics(record: Stub, content: dict[Any, Any]) -> LoadedModel
     description = as_trained(description, modules)
     model = _with_weights(description, dict(_weights(modules)))
     stride = modules[f"model.{len(description.rows) - 1}"].state.get("stride")
-    # Only the first few: a large tensor as a list of numbers would be many times as large.
-    if isinstance(stride, Tensor) and (found := stride.flatten()[:9].tolist()) != list(model.strides):
-        raise CheckpointError(f"its head has strides {shown(found)}, not {model.strides}")
+    if isinstance(stride, Tensor):
+        # Only the first few: a large tensor as a list of numbers would be many times as large.
+        found = stride[:9].tolist() if stride.dim() == 1 else f"of the shape {tuple(stride.shape)}"
+        if found != list(model.strides):
+            raise CheckpointError(f"its head has strides {shown(found)}, not {model.strides}")
     for name, module in model.named_modules():
         trained = modules.get(name)
         if isinstance(module, nn.BatchNorm2d) and trained is not None:
@@ -227,7 +231,7 @@ def _rows(table: dict[Any, Any], key: str) -> list[Any]:
 
 def _text(content: dict[Any, Any], key: str) -> str:
     value = content.get(key)
-    return value[:200] if isinstance(value, str) else ""
+    return _utf8(value[:200]) if isinstance(value, str) else ""
 
 
 def _class_names(record: Stub, table: dict[Any, Any]) -> list[str]:
@@ -265,10 +269,10 @@ def _modules(record: Stub) -> Iterator[tuple[str, Stub]]:
                 raise CheckpointError(f"{name}.{key} is not a module")
 
 
-def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
+def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, object]]:
     """Each tensor with its dotted name, removed from its module so that there is no second reference."""
     for name, module in modules.items():
-        non_persistent = module.state.get("_non_persistent_buffers_set", frozenset())
+        non_persistent = module.state.get("_non_persistent_buffers_set", set())
         for kind in ("_parameters", "_buffers"):
             tensors = module.state.get(kind, {})
             if not isinstance(tensors, dict):
@@ -276,10 +280,8 @@ def _weights(modules: dict[str, Stub]) -> Iterator[tuple[str, Tensor]]:
             for key in list(tensors):
                 _check_name(key)
                 tensor = tensors.pop(key)
-                if tensor is None or (isinstance(non_persistent, frozenset) and key in non_persistent):
+                if tensor is None or (isinstance(non_persistent, set) and key in non_persistent):
                     continue
-                if not isinstance(tensor, Tensor):
-                    raise CheckpointError(f"{name}.{key} is not a tensor")
                 yield f"{name}.{key}", tensor
 
 
@@ -288,7 +290,7 @@ def _check_name(name: object) -> None:
         raise CheckpointError(f"has a weight named {shown(name)}")
 
 
-def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> YoloModel:
+def _with_weights(description: ModelDescription, weights: dict[Any, Any]) -> YoloModel:
     """Build the described network with exactly these weights; missing and unknown names are errors.
 
     Empties `weights`, so that no tensor is held twice for longer than its layer needs.
@@ -321,16 +323,25 @@ def _with_weights(description: ModelDescription, weights: dict[str, Tensor]) -> 
     return model.eval()
 
 
-def _check_sizes(description: ModelDescription, weights: dict[str, Tensor]) -> None:
+def _check_sizes(description: ModelDescription, weights: dict[Any, Any]) -> None:
     """Reject what makes a small file large: repeated layers, and tensors that share storage."""
     repeats = sum(max(1, round(row.repeats * description.depth_multiple)) for row in description.rows)
     if repeats > _MOST_REPEATS:
         raise CheckpointError(f"describes {repeats} layers, the limit is {_MOST_REPEATS}")
-    check_storages(weights)
+    check_weights(weights)
 
 
-def check_storages(weights: Mapping[str, Tensor]) -> None:
-    """Raise `CheckpointError` if several weights are views of the same numbers."""
+def check_weights(weights: dict[Any, Any]) -> None:
+    """Raise `CheckpointError` unless these are tensors by name, plain and each with numbers of its own.
+
+    Parameters become tensors without a gradient.
+    """
+    for name, tensor in weights.items():
+        _check_name(name)
+        plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout is torch.strided
+        if not plain or tensor.device.type != "cpu" or tensor.is_quantized:
+            raise CheckpointError(f"{name} is not a tensor of numbers")
+        weights[name] = Tensor.detach(tensor)
     storages = {tensor.untyped_storage().data_ptr(): tensor.untyped_storage() for tensor in weights.values()}
     if sum(tensor.nbytes for tensor in weights.values()) > sum(map(len, storages.values())):
         raise CheckpointError("uses the same numbers for several weights; it is not a checkpoint")
@@ -362,7 +373,9 @@ def _plain(value: Any) -> Any:
             text_left -= len(value)
         if depth > _DEEPEST or nodes_left < 0 or text_left < 0:
             raise CheckpointError("its description is too deep or too long")
-        if value is None or type(value) in (bool, int, float, str):
+        if isinstance(value, str):
+            return _utf8(value)
+        if value is None or type(value) in (bool, int, float):
             return value
         if isinstance(value, dict):
             return {copy(key, depth + 1): copy(item, depth + 1) for key, item in value.items()}
@@ -371,6 +384,11 @@ def _plain(value: Any) -> Any:
         raise CheckpointError(f"has a {type(value).__name__} where a plain value belongs")
 
     return copy(value, 0)
+
+
+def _utf8(text: str) -> str:
+    """The text without halves of characters, which torch's reader accepts and nothing can print."""
+    return text.encode("utf-8", "replace").decode()
 
 
 def as_trained(description: ModelDescription, modules: Modules) -> ModelDescription:

@@ -18,7 +18,7 @@ from safetensors import SafetensorError, safe_open
 from vision.file_kinds import explained, open_file
 from vision.plain_yaml import PlainDumper, PlainYamlError, load_plain_yaml, numbered
 from vision.text_file import read_text
-from vision.yolo.safe_pickle import CheckpointError, one_line
+from vision.yolo.checkpoint_error import CheckpointError, one_line
 
 if TYPE_CHECKING:
     from torch import Tensor

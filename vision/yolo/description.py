@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from vision.yolo.checkpoint_error import shown
 from vision.yolo.layers import ACTIVATIONS
-from vision.yolo.safe_pickle import shown
 
 _LARGEST_REPEATS = 64
 # Defaults of omitted arguments; the first, the channels, has none.

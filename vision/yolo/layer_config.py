@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from torch import nn
 
+from vision.yolo.checkpoint_error import shown
 from vision.yolo.description import ArchitectureError, LayerSpec, ModelDescription
 from vision.yolo.gelan import ELAN1, SPPELAN, AConv, ADown, CBFuse, CBLinear, RepNCSPELAN4
 from vision.yolo.heads import OBB, Detect
@@ -29,7 +30,6 @@ from vision.yolo.layers import (
     SCDown,
     same_padding,
 )
-from vision.yolo.safe_pickle import shown
 
 LARGEST_KERNEL = 31
 _LARGEST_CHANNELS = 1 << 14

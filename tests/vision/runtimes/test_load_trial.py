@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import re
+import subprocess
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.vision.checkpoint_bombs import BOMBS
 from vision.runtimes import load_trial
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.onnx_runtime import onnx_facts, open_session
 from vision.runtimes.openvino_runtime import OpenVinoNetwork, openvino_facts
+from vision.runtimes.source import read_source
+from vision.yolo.checkpoint import CheckpointError, load_checkpoint
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
@@ -102,6 +108,52 @@ def test_a_file_that_is_no_network_is_named(tmp_path: Path, content: bytes) -> N
     path.write_bytes(content)
     with pytest.raises(RuntimeUnusableError, match=r"other\.onnx: is not an ONNX model, or damaged"):
         open_session(path, 1)
+
+
+# --- Checkpoints --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lists", "a tensor of a large size"])
+def test_checkpoint_that_takes_much_memory_is_refused(tmp_path: Path, name: str) -> None:
+    path = BOMBS[name][0](tmp_path / "bomb.pt")
+    with pytest.raises(CheckpointError, match=r"3\d MiB") as caught:
+        load_checkpoint(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert list((tmp_path / "cache").rglob("*.loads")) == []
+
+
+def test_checkpoint_that_takes_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = BOMBS["colliding keys"][0](tmp_path / "bomb.pt")
+    monkeypatch.setattr(load_trial, "LOAD_S", 4.0)
+    with pytest.raises(CheckpointError, match=r" 4 s"):
+        load_checkpoint(path)
+
+
+def test_readable_checkpoint_is_tried_once(
+    tmp_path: Path, checkpoint: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    def run(*arguments: Any, **options: Any) -> Any:
+        tries.append(arguments)
+        return real_run(*arguments, **options)
+
+    real_run = subprocess.run
+    monkeypatch.setattr("vision.runtimes.load_trial.subprocess.run", run)
+    for _ in range(2):
+        load_checkpoint(checkpoint)
+        read_source(checkpoint)
+    assert len(tries) == 1
+
+
+def test_torch_reads_checkpoints_in_one_place() -> None:
+    """So that no way to a checkpoint is without its trial; the others read the state of a training."""
+    root = Path(load_trial.__file__).parent.parent.parent
+    sources = [path for package in ("companion", "vision") for path in (root / package).rglob("*.py")]
+    readers = [
+        path.name for path in sources if re.search(r"= torch\.load\(|return torch\.load\(", path.read_text())
+    ]
+    assert sorted(readers) == ["torch_archive.py", "train_policy.py", "training.py"]
 
 
 # --- OpenVINO -----------------------------------------------------------------------------------------------
