@@ -467,13 +467,7 @@ class Vehicle:
         self._steps_to_control -= 1
         if self._steps_to_control <= 0:
             self._steps_to_control = STEPS_PER_CONTROL
-            estimate.refresh()
-            self.autopilot.update(CONTROL_STEP_S)
-            mission_link.update(self)
-            self.vision.update(self.now_s)
-            if self.gimbal_manager is not None:
-                self.gimbal_manager.step(CONTROL_STEP_S)
-            self._check_companion()
+            self._control()
         if self._air is not None:
             self.airframe.blow(self._air.gust_at(self.faults.elapsed_us))
         steps = self._quiet_steps(most) if most > 1 else 1
@@ -483,8 +477,22 @@ class Vehicle:
             self._steps_to_control -= steps - 1
         self.airframe.advance(STEP_S, steps)
         estimate.age(STEP_S, steps)
-        if steps > 1:
-            return steps  # nothing is due
+        if steps == 1:  # else nothing is due
+            self._send_due()
+        return steps
+
+    def _control(self) -> None:
+        """One step of the autopilot and of what runs with it."""
+        self.estimate.refresh()
+        self.autopilot.update(CONTROL_STEP_S)
+        mission_link.update(self)
+        self.vision.update(self.now_s)
+        if self.gimbal_manager is not None:
+            self.gimbal_manager.step(CONTROL_STEP_S)
+        self._check_companion()
+
+    def _send_due(self) -> None:
+        """Send what is due on each link: queued texts and commands, streams, lists, files."""
         if not self._origin_sent and self.autopilot.sensors_ready:
             self._origin_sent = True  # GPS_GLOBAL_ORIGIN is sent when it changes: once
             for link in self.links.values():
@@ -493,7 +501,7 @@ class Vehicle:
             self._send_queued()
         for link in self.links.values():
             if link.streams.next_us <= self._boot_us:
-                estimate.refresh()
+                self.estimate.refresh()
                 for name in link.streams.due(self._boot_us):
                     if name == "CURRENT_MODE":
                         link.status_is_due = True
@@ -506,7 +514,6 @@ class Vehicle:
                 parameter_protocol.continue_list(link, self.parameters, STEP_S)
             if link.file_transfer is not None:
                 file_transfer.continue_transfer(link, self.now_s)
-        return steps
 
     def _check_companion(self) -> None:
         seen = self._companion_seen_s
