@@ -22,7 +22,6 @@ EXTRA_OF = {
     "openvino": "models",
     "prometheus_client": "service",
     "pyrealsense2": "cameras",
-    "pyulog": "recording",
     "ray": "learn",
     "small_gicp": "cameras",
     "stable_baselines3": "learn",

@@ -35,7 +35,7 @@ _MAGIC: tuple[tuple[bytes, int, str], ...] = (
     (b"ftyp", 4, _MP4),
     (b"\x1aE\xdf\xa3", 0, _MATROSKA),
     (b"\x89MCAP0\r\n", 0, "is a recording (MCAP): `companion log show` shows it"),
-    (b"ULog\x01\x12\x35", 0, "is a log of PX4 (ULog): `companion log ulog` adds it to a recording"),
+    (b"ULog\x01\x12\x35", 0, "is a log of PX4 (ULog): PlotJuggler shows it, and PX4's Flight Review"),
     (b"\xa3\x95\x80", 0, "is a log of ArduPilot (dataflash): read it with a ground station"),
     (b"#ROSBAG", 0, "is a bag of ROS 1: convert it with `mcap convert`"),
     (b"SQLite format 3\0", 0, "is a SQLite database, such as a bag of ROS 2: convert it to MCAP"),

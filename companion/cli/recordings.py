@@ -239,32 +239,3 @@ def write_tlog(
     for line in problems:
         typer.echo(f"companion: {line}", err=True)
     typer.echo(f"{output}: {frames} MAVLink messages")
-
-
-@log.command("ulog")
-def add_ulog(
-    file: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording.")],
-    ulog: Annotated[Path, typer.Argument(metavar="ULOG", help="PX4's log of the same flight.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="OUTPUT", help="The new file.")],
-) -> None:
-    """Copy a recording and add PX4's log.
-
-    Converts the log's times to the recording's.
-    """
-    from companion.recording import RecordingError
-    from companion.recording.ulog import merge_ulog
-
-    with plain_errors(RecordingError):
-        merged = merge_ulog(file, ulog, output)
-    for line in merged.problems:
-        typer.echo(f"companion: {line}", err=True)
-    found = merged.alignment
-    typer.echo(f"{output}: {merged.messages} messages, {merged.topics} topics of {ulog}")
-    typer.echo(
-        f"Unix time = boot time + {found.offset_ns / 1e9:.6f} s, drift {found.drift * 1e6:+.1f} ppm, "
-        f"error at most {found.error_ns / 1e6:.2f} ms"
-    )
-    typer.echo(
-        f"{found.equal} samples are in both files; from stamp to arrival {found.least_delay_ns / 1e6:.2f} ms "
-        f"at least, {found.median_delay_ns / 1e6:.2f} ms median"
-    )

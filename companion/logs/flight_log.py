@@ -13,17 +13,15 @@ from typing import Any
 from companion.bus.topics import EVENTS, LARGE_TOPICS, VEHICLE
 from companion.recording import RecordingError
 from companion.recording.convert import (
-    LOG_CHANNEL,
     OUTPUT_CHANNEL,
     RECORDER_CHANNEL,
     RUN_CHANNEL,
-    ULOG_NAME,
 )
 from companion.recording.files import RecordingReader
 from vision.file_kinds import is_hidden
 
 _LARGE = {topic.name: topic.name.replace("_", " ") + "s" for topic in LARGE_TOPICS}
-_READ = (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL, LOG_CHANNEL)
+_READ = (RUN_CHANNEL, EVENTS.name, VEHICLE.name, OUTPUT_CHANNEL, RECORDER_CHANNEL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +41,7 @@ class RecordingSummary:
         lines: (Unix time, kind, text) of events, modes and refused commands, in order.
         large: topic of images, depth images and point clouds → how many are recorded.
         losses: the recorder's last note about losses.
-        metadata: of the file, such as the clock of a ULog in it.
+        metadata: that another program added to the file.
         problems: damage of the file, and a line if it is not ended.
         ended: whether the file has its end: not while it is being recorded.
     """
@@ -113,9 +111,6 @@ def summarize(path: Path) -> RecordingSummary:
                     found.losses = message
                 case topic if topic == EVENTS.name:
                     found.lines.append((log_time_ns, message["level"], message["text"]))
-                case topic if topic == LOG_CHANNEL:
-                    if message["name"] == ULOG_NAME:  # the others are events
-                        found.lines.append((log_time_ns, ULOG_NAME, message["message"]))
                 case topic if topic == OUTPUT_CHANNEL:
                     found.lines += [
                         (log_time_ns, "refused", f"{event['behaviour']}: {event['message']}")

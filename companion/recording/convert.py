@@ -45,8 +45,6 @@ from companion.recording.link_bytes import unpack_link_bytes
 RUN_CHANNEL, INPUT_CHANNEL, OUTPUT_CHANNEL = "run", "guidance_input", "guidance_output"
 RECEIVED_CHANNEL, SENT_CHANNEL, RECORDER_CHANNEL = "mavlink_received", "mavlink_sent", "recorder"
 LOG_CHANNEL = "/log"
-ULOG_NAME = "ulog"
-"""Begins the names of a ULog's topics and metadata; the name in its messages on `/log`."""
 ANY_OBJECT = b'{"type":"object"}'
 _BODIES = {topic.name: topic.body for topic in TOPICS}
 _OF_RECORDER = {
@@ -351,25 +349,24 @@ class Converter:
 
     def _log(self, _camera: str, message: dict[str, Any]) -> Iterator[tuple[str, str, Any]]:
         unix_ns, level = message["stamp_ns"] + self._offset_ns, _LEVELS.get(message["level"], 0)
-        yield LOG_CHANNEL, "Log", log_body(unix_ns, level, message["text"], self._vehicle)
+        yield (
+            LOG_CHANNEL,
+            "Log",
+            {
+                "timestamp": _unix_time(unix_ns),
+                "level": level,
+                "message": message["text"],
+                "name": self._vehicle,
+                "file": "",
+                "line": 0,
+            },
+        )
 
     def _time(self, stamp_ns: int) -> dict[str, int]:
         return _unix_time(stamp_ns + self._offset_ns)
 
     def _camera_frame(self, camera: str) -> str:
         return f"{self._vehicle}/{camera or 'camera'}"
-
-
-def log_body(unix_ns: int, level: int, text: str, name: str) -> dict[str, Any]:
-    """Return a foxglove.Log. `level`: of foxglove.LogLevel. `name`: of the source."""
-    return {
-        "timestamp": _unix_time(unix_ns),
-        "level": level,
-        "message": text,
-        "name": name,
-        "file": "",
-        "line": 0,
-    }
 
 
 def _unix_time(unix_ns: int) -> dict[str, int]:

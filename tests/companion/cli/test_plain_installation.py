@@ -43,7 +43,6 @@ OPTIONAL = {
     "gymnasium": ("companion.learning.train_policy", "mavlink_sim.environments"),
     "mavsdk": ("companion.vehicle.mavsdk_driver",),
     "mcp_types": ("companion.language.mcp_server",),
-    "pyulog": ("companion.recording.ulog",),
 }
 NOBODY = ("--connect", "tcp/127.0.0.1:1")  # where no service answers
 ENDS = ""  # ends, with output or one line of its own
@@ -112,7 +111,6 @@ WALK: Walk = [
     ("log show", ("flight.mcap",), "recording"),
     ("log recover", ("flight.mcap", "out.mcap"), "recording"),
     ("log tlog", ("flight.mcap", "out.tlog"), "recording"),
-    ("log ulog", ("flight.mcap", "flight.ulg", "--output", "out.mcap"), "recording"),
 ]
 SIMULATOR_WALK: Walk = [
     ("", ("--camera-output", "rtp://127.0.0.1:5600"), "cameras"),

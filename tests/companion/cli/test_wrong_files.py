@@ -86,8 +86,6 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "log show file": (("log show {}", ".mcap"),),
     "log recover file": (("log recover {} out.mcap", ".mcap"),),
     "log tlog file": (("log tlog {} out.tlog", ".mcap"),),
-    "log ulog file": (("log ulog {} flight.ulg -o out.mcap", ".mcap"),),
-    "log ulog ulog": (("log ulog flight.mcap {} -o out.mcap", ".ulg"),),
     "config": (("config --config {}", ".toml"),),
     "vehicle.signing_key_file": (("config --check --vehicle-signing-key-file {}", ".key"),),
     "source.depth": (("depth frame.png --source-depth {} --limit 1", ".npy"),),
@@ -163,7 +161,7 @@ WRITTEN = {
     "record directory", "collect folder", "evaluate misses", "train output", "train-policy output",
     "models list folder", "models pull folder", "models export output", "calibrate lens output",
     "calibrate lens report", "calibrate extrinsics output", "markers detect save", "markers print output",
-    "log recover output", "log tlog output", "log ulog output", "recording.video", "recording.directory",
+    "log recover output", "log tlog output", "recording.video", "recording.directory",
 }  # fmt: skip
 # Read by what other rows run: the service opens them as `detect` does.
 ELSEWHERE = {"view source", "play scene", "replay model", "source.uri", "detector.model"}
