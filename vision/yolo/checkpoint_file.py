@@ -70,8 +70,7 @@ def read_archive(path: str | Path) -> Any:
     try:
         return _read(path)
     except CheckpointError as error:
-        # A checkpoint is a zip archive: of these the error says more.
-        line = explained(path, f"{path}: {error}", "is a checkpoint of torch", "is a zip archive")
+        line = explained(path, f"{path}: {error}", "is a checkpoint of torch")
         raise type(error)(one_line(line)) from None
     except RuntimeUnusableError as error:
         raise CheckpointError(one_line(str(error))) from None
@@ -110,9 +109,8 @@ def _read(path: Path) -> Any:
                 "the file is a TorchScript program, not a checkpoint; rename it to end in .torchscript, "
                 "or give the .pt of training"
             ) from None
-        reason = re.split(r"\n|\. ", f"{type(error).__name__}: {error}")[0]
         raise CheckpointError(
-            f"the archive is truncated or damaged ({reason:.200}); copy or download it again"
+            "the archive is truncated or damaged, or its pickle is; copy or download it again"
         ) from None
 
 
