@@ -26,10 +26,9 @@ from mavlink_sim.camera.scene_file import SceneError, load_scene
 from tests.companion.command_line import companion_here
 from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
-from vision.weights import DEFAULT_EXPORT
 
 # Parameter → its readers: the arguments, with {} for the file, and the suffix that selects the reader.
-_DETECT = "detect {} --limit 1"
+_DETECT = "detect {} --model small.onnx --limit 1"
 _LENS = "calibrate lens {} --board chessboard 7x5 --square 0.03"
 _EXTRINSICS = (
     "calibrate extrinsics {colour} {infrared} --board chessboard 7x5 --square 0.03 --colour-calibration "
@@ -65,11 +64,11 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "models info file": tuple(("models info {}", suffix) for suffix in _MODELS),
     "models export file": (("models export {} --to onnx", ".pt"),),
     "models export calibrate": (
-        ("models export default --to onnx --output out.onnx --precision int8 --calibrate {}", ".zip"),
+        ("models export small.pt --to onnx --output out.onnx --precision int8 --calibrate {}", ".zip"),
     ),
     "models verify source": (("models verify {} frame.png", ".pt"),),
-    "models verify exported": (("models verify default {}", ".onnx"),),
-    "models verify images": (("models verify default bundled.onnx --images {}", ".zip"),),
+    "models verify exported": (("models verify small.pt {}", ".onnx"),),
+    "models verify images": (("models verify small.pt small.onnx --images {}", ".zip"),),
     "calibrate lens source": ((_LENS, ".mp4"),),
     "calibrate extrinsics colour": ((_extrinsics("colour"), ".mp4"),),
     "calibrate extrinsics infrared": ((_extrinsics("infrared"), ".mp4"),),
@@ -204,7 +203,7 @@ def test_every_file_of_the_command_line_is_tried() -> None:
 
 
 @pytest.fixture
-def right(tmp_path: Path) -> Path:
+def right(tmp_path: Path, small_model: Path, exported_model: Path) -> Path:
     """A folder with the files that the other arguments name."""
     cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((480, 640, 3), np.uint8))
     write_camera_info(tmp_path / "camera.yaml", CameraModel(640, 480, 600.0, 600.0, 320.0, 240.0), "camera")
@@ -219,7 +218,8 @@ def right(tmp_path: Path) -> Path:
         "categories": [{"id": 1, "name": "x"}],
     }
     (tmp_path / "annotations.json").write_text(json.dumps(coco))
-    shutil.copy(DEFAULT_EXPORT, tmp_path / "bundled.onnx")
+    shutil.copy(small_model, tmp_path / "small.pt")
+    shutil.copy(exported_model, tmp_path / "small.onnx")
     write_messages(tmp_path / "flight.mcap", (), {})
     return tmp_path
 
