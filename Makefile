@@ -25,7 +25,7 @@ endef
 
 # Package indexes may be slow: the command is tried three times; then the last line names what could not be installed.
 define TRY
-@for try in 1 2 3; do if timeout 600 sh -ec '$(2)'; then exit 0; fi; sleep $$((5 * try)); done; \
+for try in 1 2 3; do if timeout 600 sh -ec '$(2)'; then exit 0; fi; sleep $$((5 * try)); done; \
 	echo "make programs: could not install $(1); the lines above say why" >&2; exit 1
 endef
 
@@ -58,17 +58,17 @@ test-slow: $(READY)
 
 programs: debian $(AXE) $(MAVPROXY)
 
-debian: DEBIAN = $(shell $(PYTHON) -m tests.programs debian)
 debian:
-	$(if $(DEBIAN),$(call TRY,$(DEBIAN),apt-get update -qq; DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends $(DEBIAN)))
+	@packages=$$($(PYTHON) -m tests.programs debian) || exit 1; test -n "$$packages" || exit 0; export packages; \
+	$(call TRY,$$packages,apt-get update -qq; DEBIAN_FRONTEND=noninteractive apt-get install -qq --no-install-recommends $$packages)
 
 $(AXE): $(PAGE_TESTS)/package-lock.json | debian
-	$(call TRY,axe-core,cd $(PAGE_TESTS); npm ci --ignore-scripts)
+	@$(call TRY,axe-core,cd $(PAGE_TESTS); npm ci --ignore-scripts)
 	@touch $@
 
 $(MAVPROXY): constraints.txt
 	@test -x $(@D)/python || $(PYTHON) -m venv .venv-mavproxy
-	$(call TRY,MAVProxy,$(@D)/python -m pip install --quiet --constraint constraints.txt pymavlink pyserial==3.5; $(@D)/python -m pip install --quiet --no-deps MAVProxy==1.8.75)
+	@$(call TRY,MAVProxy,$(@D)/python -m pip install --quiet --constraint constraints.txt pymavlink pyserial==3.5; $(@D)/python -m pip install --quiet --no-deps MAVProxy==1.8.75)
 	@touch $@
 
 lint: $(READY)
