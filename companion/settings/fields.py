@@ -70,7 +70,8 @@ def help_line(section: type[Section], name: str) -> str:
     field = section.model_fields[name]
     annotation, _ = _without_none(field)
     text = section.help_texts().get(name, "")
-    span = " or ".join(get_args(annotation)) if get_origin(annotation) is Literal else _span(field)
+    kind = get_args(annotation)[0] if get_origin(annotation) is tuple else annotation
+    span = " or ".join(get_args(kind)) if get_origin(kind) is Literal else _span(field)
     return f"{text} ({span})" if span else text
 
 
@@ -85,7 +86,7 @@ def expectation(field: FieldInfo) -> str:
         item = get_args(annotation)[0]
         meaning = _pattern_meaning(get_args(item)[1:]) if str in get_args(item) else None
         if get_origin(item) is Literal:
-            meaning = ", ".join(get_args(item))
+            meaning = f"one of {', '.join(get_args(item))}"
         words = "a list of texts" + (f", each {meaning}" if meaning else "")
     else:
         words = _pattern_meaning(field.metadata) or _KINDS[annotation]

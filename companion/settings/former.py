@@ -58,7 +58,7 @@ _CONTENT = 'recording.content lists what is recorded beside the messages: "jpeg"
 REMOVED = {
     **{f"camera.{name}": Removed(_LENS_FILE, _same(was)) for name, was in LENS.items()},
     "detector.every": Removed(
-        "set detector.rate_hz, the source's rate divided by it; 1 is no limit", _same(1)
+        "set detector.rate_hz to the source's rate divided by it; 1 is the default", _same(1)
     ),
     "detector.max_age_s": Removed(
         "remove it: guidance.perception_max_age_s limits the age of detections in flight", _same(None)

@@ -26,7 +26,7 @@ class RecordingSection(VideoSection):
     directory: str = ""
     """folder of the MCAP recordings, one per run (extra `recording`); empty: none"""
     content: tuple[Literal["jpeg", "png", "depth", "clouds"], ...] = ("jpeg",)
-    """beside messages: preview images (jpeg) or whole processed frames (png), depth images, point clouds"""
+    """what is recorded beside messages; jpeg: preview images, or png: whole processed frames"""
     max_file_mb: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     """size at which the next file begins, megabytes; it also begins after an hour"""
     max_total_mb: Annotated[int, Field(ge=1, le=100_000_000)] = 10_000

@@ -203,9 +203,10 @@ class _Reading:
             keys = ", ".join(f"{table}.{name}" for name in lens)
             origins = ", ".join(dict.fromkeys(origin for _, origin in lens.values()))
             line = lens_line({name: value for name, (value, _) in lens.items()})
+            removed = f"{'was' if len(lens) == 1 else 'were'} removed in version {VERSION}"
             self._problems.append(
-                f"{keys} ({origins}) removed in version {VERSION}: write the line {line} to a file such as "
-                f'camera.yaml, and set {table}.calibration_file = "camera.yaml"'
+                f"{keys} ({origins}) {removed}: write the line {line} to a file such as camera.yaml, and set "
+                f'{table}.calibration_file = "camera.yaml"'
             )
         values: dict[str, Any] = {}
         for table, items in self._values.items():

@@ -102,13 +102,16 @@ def test_stamps_are_of_the_simulated_clock(airborne: LockstepVehicle) -> None:
     assert (result.captured_ns, result.inferred_ns) == (5_000_000_000, 5_080_000_000)
 
 
-def test_stale_frames_are_left_out_by_the_simulated_clock(airborne: LockstepVehicle) -> None:
-    perception = RenderedPerception(settings_of(detector__max_age_s="0.5"), airborne, SCENE)
+def test_frames_above_the_rate_are_left_out(airborne: LockstepVehicle) -> None:
+    perception = RenderedPerception(settings_of(detector__rate_hz="2"), airborne, SCENE)
     captured = perception.capture(5_000_000_000)
     assert captured is not None
-    assert perception.process(captured.frame, 5_400_000_000) is not None
-    late = replace(captured.frame, sequence=captured.frame.sequence + 1)
-    assert perception.process(late, 5_600_000_000) is None
+    processed = []
+    for number in range(4):
+        stamp_ns = 5_000_000_000 + number * 250_000_000
+        frame = replace(captured.frame, sequence=number, captured_ns=stamp_ns)
+        processed.append(perception.process(frame, stamp_ns) is not None)
+    assert processed == [True, False, True, False]
 
 
 def test_frame_is_the_camera_process_s_frame(airborne: LockstepVehicle, segment: str) -> None:

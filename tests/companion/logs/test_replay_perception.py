@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -24,7 +24,7 @@ from companion.bus.topics import STATUS
 from companion.logs.replay import replay, report
 from companion.logs.replay_perception import DEPTH_INEXACT, SAMPLES_INEXACT, _as_in_flight
 from companion.recording import RecordingError
-from companion.recording.convert import ANY_OBJECT, RUN_CHANNEL
+from companion.recording.convert import ANY_OBJECT, INPUT_CHANNEL, RUN_CHANNEL
 from companion.recording.files import Channel, Recorded
 from companion.settings.perception import DEFAULT_MODEL, DetectorSection
 from mavlink_sim.lockstep import LockstepVehicle
@@ -283,3 +283,40 @@ def test_unknown_model_is_one_line(short: Path, tmp_path: Path) -> None:
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "none.pt" in done.stderr
+
+
+def former_keys(section: dict[str, Any]) -> dict[str, Any]:
+    """A section `camera` as it was recorded while its lens was eight keys."""
+    lens = section.pop("lens")
+    section |= {f"{name}_px": lens[name] for name in ("fx", "fy", "cx", "cy")}
+    section |= {f"calibrated_{name}": lens[name] for name in ("width", "height")}
+    return section | {name: lens[name] for name in ("distortion", "distortion_model")}
+
+
+@pytest.mark.parametrize(("camera_motion", "reasons"), [(True, 0), (False, 1)])
+def test_recording_with_removed_keys_replays(
+    short: Path, tmp_path: Path, camera_motion: bool, reasons: int
+) -> None:
+    def change(message: Recorded) -> Recorded:
+        if message.channel.topic not in (RUN_CHANNEL, INPUT_CHANNEL):
+            return message
+        content = json.loads(message.data)
+        if message.channel.topic == RUN_CHANNEL:
+            settings = content["settings"]
+            settings["camera"] = former_keys(settings["camera"])
+            settings["detector"] |= {"every": 1, "max_age_s": None, "tile_size": 640, "tile_overlap": 0.2}
+            settings["tracker"] |= {"high_confidence": 0.35, "low_confidence": 0.1}
+            settings["tracker"] |= {"camera_motion": camera_motion}
+            settings["preview"] |= {"quality": 80, "cloud_voxel_m": 0.1}
+        else:
+            context = content["context"]
+            context["camera"] = json.dumps(former_keys(json.loads(context["camera"])))
+        return message._replace(data=json.dumps(content).encode())
+
+    old = rewritten(short, tmp_path, change)
+    assert replay([old], {}).differing_steps == 0
+    found = replay([old], {}, DEFAULT_MODEL)
+    assert found.detections is not None
+    assert found.detections.identical_images == found.detections.frames > 10
+    assert (found.differing_steps, len(found.inexact)) == (0, reasons)
+    assert all("tracker.camera_motion" in reason for reason in found.inexact)
