@@ -70,7 +70,8 @@ def read_archive(path: str | Path) -> Any:
     try:
         return _read(path)
     except CheckpointError as error:
-        line = explained(path, f"{path}: {error}", "is a checkpoint of torch")
+        # A checkpoint is a zip archive: of these the error says more.
+        line = explained(path, f"{path}: {error}", "is a checkpoint of torch", "is a zip archive")
         raise type(error)(one_line(line)) from None
     except RuntimeUnusableError as error:
         raise CheckpointError(one_line(str(error))) from None
@@ -110,7 +111,7 @@ def _read(path: Path) -> Any:
                 "or give the .pt of training"
             ) from None
         raise CheckpointError(
-            "the archive is truncated or damaged, or its pickle is; copy or download it again"
+            "not an archive of torch.save, or truncated or damaged; copy or download it again"
         ) from None
 
 
