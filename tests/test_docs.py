@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import re
 import shlex
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,9 @@ import typer
 from companion.cli import app as companion_app
 from companion.guidance import grammar
 from companion.guidance.command import COMMANDS
+from companion.settings.fields import fields_of_sections
+from companion.settings.former import REMOVED, RENAMED
+from companion.settings.reading import flags
 from mavlink_sim.cli.main import app as simulator_app
 
 ROOT = Path(__file__).parent.parent
@@ -99,6 +103,24 @@ def test_flight_command_table_is_complete() -> None:
     rows = re.findall(r"^\| (`.*?) \|", (ROOT / "docs" / "flight.md").read_text(), re.MULTILINE)
     commands = [grammar.parse(text) for row in rows for text in re.findall(r"`([^`]+)`", row)]
     assert {type(command) for command in commands} == set(COMMANDS.values())
+
+
+def settings_in_blocks(text: str) -> Iterator[str]:
+    """The keys of the blocks that are a settings file, without the names of cameras."""
+    for block in re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL):
+        tables = tomllib.loads(block)
+        if tables.keys() <= {*fields_of_sections(), "cameras"}:
+            for sections in (tables, *tables.pop("cameras", {}).values()):
+                yield from (f"{name}.{key}" for name, table in sections.items() for key in table)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+def test_settings_in_documents_exist(document: Path) -> None:
+    text = document.read_text()
+    if document.name != "scenes.md":  # its blocks are files of scenes
+        assert set(settings_in_blocks(text)) <= {flag.key for flag in flags()}
+    named = set(re.findall(r"\b[a-z]+\.[a-z_]+\b", text))
+    assert not named & (RENAMED.keys() | REMOVED.keys())
 
 
 def test_every_parameter_that_the_sitl_tests_set_is_documented() -> None:

@@ -100,7 +100,7 @@ def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
 
 def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(SourceError, match=r"a\.exr: .*mavlink-companion\[exr\].*32-bit TIFF"):
+    with pytest.raises(SourceError, match=r"a\.exr: .*mavlink-companion\[cameras\].*32-bit TIFF"):
         decode_depth(tmp_path / "a.exr", b"")
 
 

@@ -328,5 +328,5 @@ def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     from companion.language.endpoints import LanguageError, endpoint_of
 
     monkeypatch.setitem(sys.modules, "httpx", None)
-    with pytest.raises(LanguageError, match=r"\[llm\]"):
+    with pytest.raises(LanguageError, match=r"\[language\]"):
         endpoint_of("http://127.0.0.1:11434", "small")

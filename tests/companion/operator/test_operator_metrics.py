@@ -36,8 +36,7 @@ def test_metrics_and_tracks_of_a_running_service(seeing: list[str], tmp_path: Pa
     # An untrained network has low confidences; all its non-overlapping boxes are used.
     flags = [
         *(*seeing, "--metrics-listen", f"127.0.0.1:{port}", "--detector-rate-hz", "4"),
-        *("--confidence", "0", "--detector-iou", "0.05"),
-        *("--tracker-high-confidence", "0", "--tracker-low-confidence", "0", "--tracker-confirm-score", "0"),
+        *("--confidence", "0", "--detector-iou", "0.05", "--tracker-confirm-score", "0"),
     ]
     tracks: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     detections: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
@@ -96,7 +95,7 @@ def test_busy_metrics_address_is_reported() -> None:
 
 def test_missing_library_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "prometheus_client", None)
-    with pytest.raises(MetricsError, match=r" install 'mavlink-companion\[metrics\]'"):
+    with pytest.raises(MetricsError, match=r" install 'mavlink-companion\[service\]'"):
         MetricsServer("127.0.0.1:0", lambda: None)
 
 

@@ -69,5 +69,5 @@ def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(builtins, "__import__", without)
     few = PointCloud(np.eye(3, dtype=np.float32))
-    with pytest.raises(RegistrationError, match=r"mavlink-companion\[cloud\]"):
+    with pytest.raises(RegistrationError, match=r"mavlink-companion\[cameras\]"):
         align(few, few)

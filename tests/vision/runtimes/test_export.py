@@ -7,6 +7,7 @@ import enum
 import hashlib
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 from importlib.machinery import ModuleSpec
@@ -23,6 +24,7 @@ from mavlink_sim.datasets.training_scenes import random_scene
 from tests.vision.runtimes.conftest import NAMES, make_image, needs
 from vision.detector import Detector, class_names_of
 from vision.exports.export import export
+from vision.extras import install_command
 from vision.runtimes import conversion
 from vision.runtimes.base import RUNTIMES, RuntimeMissingError, RuntimeName, RuntimeUnusableError, installed
 from vision.runtimes.exported import (
@@ -232,7 +234,7 @@ def test_export_for_a_missing_runtime_names_the_extra(
     checkpoint: Path, tmp_path: Path, runtime: RuntimeName
 ) -> None:
     kind = {"onnxruntime": "onnx", "openvino": "openvino", "tensorrt": "tensorrt"}[runtime]
-    with pytest.raises(RuntimeMissingError, match=rf"mavlink-companion\[{runtime}\]"):
+    with pytest.raises(RuntimeMissingError, match=re.escape(install_command(runtime))):
         export(checkpoint, kind, tmp_path / f"net{SUFFIXES[kind]}")  # type: ignore[arg-type,index]
 
 
@@ -248,7 +250,7 @@ def test_onnx_export_does_not_need_onnxruntime(
     conversion.write_onnx(network, facts, path)
     assert path.stat().st_size > 0
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[torch\]"):
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[models\]"):
         conversion.write_onnx(network, facts, path)
 
 
@@ -352,15 +354,15 @@ def engine(tmp_path: Path) -> Path:
 
 @absent
 def test_running_without_tensorrt_names_the_extra(engine: Path) -> None:
-    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[nvidia\]"):
         TensorRtRuntime(engine)
-    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[nvidia\]"):
         Detector(engine)  # the default of its kind of file
 
 
 @absent
 def test_building_without_tensorrt_names_the_extra(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[tensorrt\]"):
+    with pytest.raises(RuntimeMissingError, match=r"mavlink-companion\[nvidia\]"):
         build_plan(tmp_path / "net.onnx", largest_side=640, stride=32)
 
 
