@@ -50,7 +50,6 @@ NOT_RUN = {
     "--frames 500": "renders for 15 s",
     "--frames 2000": "renders for 70 s",
     "--language-model": "a language model",
-    "14_16_02.ulg": "a log that PX4 wrote",
     "install mavlink-companion": "downloads",
     "install 'mavlink-companion": "downloads",
     "install --no-compile mavlink-companion": "downloads",
