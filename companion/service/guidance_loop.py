@@ -31,6 +31,7 @@ from companion.vehicle.streamer import Streamer, StreamState
 _ANSWERED = (EventKind.REFUSED, EventKind.ENDED, EventKind.STARTED)
 # How long the shutdown waits for the release of resources such as gimbal control.
 RELEASE_TIMEOUT_S = 3.0
+_HEARTBEAT_S = 1.2  # autopilots send one a second
 
 
 def mode_at_shutdown(state: VehicleState, phase: Phase, stream: StreamState) -> FlightMode | None:
@@ -147,9 +148,18 @@ class GuidanceLoop:
                 self._on_event("error", f"shutdown: {error}; {outcome.text}")
             finally:
                 await self.wait_released()
-                if (state := self._driver.state).armed:
+                if (state := await self._newest_state()).armed:
                     now = without_service_text(state, self._inputs.parameters, has_vehicle=True)
                     self._on_event("warning", f"the service ends, its vehicle is armed: {now}")
+
+    async def _newest_state(self) -> VehicleState:
+        """The state with a heartbeat from now on, if one comes: an older one lacks an accepted disarming."""
+        now_ns, until_s = time.monotonic_ns(), time.monotonic() + _HEARTBEAT_S
+        while (
+            (state := self._driver.state).armed and state.heartbeat_ns < now_ns and time.monotonic() < until_s
+        ):
+            await self._wait_for_input_until(time.monotonic() + self._period_s)
+        return state
 
     async def _leave(self, state: VehicleState, mode: FlightMode | None, *, on_ground: bool) -> None:
         """Disarm on the ground; if that is refused, or in the air, request the mode."""
