@@ -3,7 +3,7 @@
     python benchmarks/bundled_model.py --image-size 320
 
 renders frames of the default world (of seeds that training never uses), of every example scene and of the
-training scenes' kind with `mavlink-sim dataset`, and evaluates the model as `companion evaluate` does.
+training scenes' kind with `mavlink-sim dataset`, and evaluates the model as `companion learn evaluate` does.
 Evaluated are objects of which a third is visible and whose box is at least MIN_SIDE_PX and MIN_AREA_PX
 large at the input of the network. Smaller ones may be found or not; to call one by another class is always
 wrong. Precision and recall are those at the confidence that a target needs to be confirmed.

@@ -25,17 +25,21 @@ KEPT = (
     ('companion run --source "udp://', "service", "", "ready: commands on"),
     ("companion run", "service", "udpin://", "up: autopilot"),
     ("companion run", "service", "", "ready: commands on"),
+    ("companion view --connect", "dashboard", "", ""),
     ("companion view", "service", "", "up: camera"),
     ("ffmpeg ", "service", "| companion run", "perception running"),
-    ("companion dashboard", "dashboard", "", ""),
     ("companion mcp --listen", "tools", "", "mcp: http://"),
     ("mavlink-sim --", "vehicle", "--camera", "is on"),
     ("mavlink-sim( --|$)", "vehicle", "", ""),
     ("mavlink-sim camera", "camera", "", "ready: "),
     ("tensorboard", "tensorboard", "", "TensorBoard"),
 )
-AFTER_FLIGHT = ("companion replay", "companion collect")  # the page ends the service before
-PRINTS = ("companion echo", "companion markers shm://", "companion preview shm://")  # without end
+AFTER_FLIGHT = ("companion log replay", "companion learn collect")  # the page ends the service before
+PRINTS = (  # without end
+    "companion echo",
+    "companion detect shm://front --model none --level",
+    "companion detect shm://front --model none --markers",
+)
 WATCHED = (  # flies long: other tests fly
     'companion ask "find ',
     'companion send "goto ',
@@ -46,7 +50,7 @@ QUESTION, ANSWER = "fly this? [y/N]", b"y\n"
 ASKS = 'companion ask "'
 COMMAND_S = 120.0
 ENDED = (0, 128 + signal.SIGINT)
-DIFFERS = "companion replay"  # with exit code 1
+DIFFERS = "companion log replay"  # with exit code 1
 
 
 def open_terminal(line: str) -> ServiceProcess:

@@ -119,7 +119,6 @@ SINGLE_STEP_TESTS = {
 # Elsewhere `companion.host.tasks.spawn`, which logs an error that ends a task: here the task is awaited where
 # it is started, so the error is raised there.
 AWAITED_TASKS = {
-    "companion/bench/bus.py",
     "companion/bench/setpoints.py",
     "companion/cli/ask.py",
     "companion/cli/run.py",

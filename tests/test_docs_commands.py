@@ -36,8 +36,8 @@ NOT_RUN = {
     "/dev/v4l/": "a camera",
     "csi://0": "a camera",
     "companion calibrate photos": "photographs of a printed board",
-    "companion calibrate extrinsics colour": "images of two cameras",
-    "companion markers images/": "photographs of a marker",
+    "companion calibrate colour": "images of two cameras",
+    "companion detect images/": "photographs of a marker",
     "--pull": "a download",
     "--from yolov8n": "a download, and photographs",
     "--most 50": "a service on another computer",
@@ -65,11 +65,11 @@ NOT_RUN = {
     "ray ": "a Ray cluster",
     "--ray ": "a Ray cluster",
     "pytest -m sitl": "flights of 15 minutes",
-    "train-policy": "trains for minutes",
+    "--policy": "trains for minutes",
     "FLIGHT.tlog": "a log of a flight; test_recorded_flight has one",
     'send "seek car"': "needs detections, which are late on a busy machine",
     "policy my_approach.onnx": "needs detections, as above",
-    "companion train --data labelled": "trains for hours",
+    "companion learn train --data labelled": "trains for hours",
     "bench detector": "measures for minutes",
     "tools.train_bundled_model": "trains on a GPU",
     "benchmarks/bundled_model.py": "renders 2,000 frames",
@@ -79,7 +79,7 @@ NOT_RUN = {
 # What takes minutes or hours as printed, and what is run instead.
 SHORTENED = {
     "--frames 900": "--frames 12",
-    "companion train --data drones": "companion train --steps 2 --batch-size 2 --image-size 96 --data drones",
+    "learn train --data drones": "learn train --steps 2 --batch-size 2 --image-size 96 --data drones",
 }
 
 

@@ -1,7 +1,7 @@
 """A copy of the simulator with its hot modules compiled by mypyc, for training on the whole autopilot.
 
     python -m tools.compile_simulator FOLDER
-    PYTHONPATH=FOLDER companion train-policy …
+    PYTHONPATH=FOLDER companion learn train --policy …
 
 The same flights as with pure Python, bit for bit, on the Python version and processor type that compiled it.
 Needs the extra `dev` and a C compiler.

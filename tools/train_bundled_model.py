@@ -2,7 +2,7 @@
 
     python -m tools.train_bundled_model runs/default.safetensors --minutes 9
 
-`companion train` does the same on a processor, in hours. Here processes draw the scenes of
+`companion learn train` does the same on a processor, in hours. Here processes draw the scenes of
 `mavlink_sim.datasets.training_scenes` into a pool in shared memory and replace the oldest ones without end.
 The trainer keeps a copy of the pool on the GPU and makes its batches there, as
 `vision.training.scene_batches` does on the processor: a whole scene, reduced, or a part of it, mirrored and

@@ -99,7 +99,7 @@ def _about(name: str) -> str:
     return f"{_FAMILIES[name[:6]]}, scale {name[6]}, 80 classes of COCO"
 
 
-# The permissive ones first: `models list` shows them in this order.
+# The permissive ones first: `models show` shows them in this order.
 KNOWN: dict[str, KnownModel] = {
     name: KnownModel(
         name,

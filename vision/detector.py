@@ -400,6 +400,6 @@ def model_path(
     if not path.is_file():
         raise CheckpointError(
             f"{path}: the bundled model is missing from this installation; "
-            "reinstall the package, train one with `companion train`, or give the path of another"
+            "reinstall the package, train one with `companion learn train`, or give the path of another"
         )
     return path

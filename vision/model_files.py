@@ -76,4 +76,4 @@ def missing_model_advice(path: Path) -> str:
         return f"{absent} pull {path.stem}` downloads it"
     if path.suffix or path.name != str(path):
         return "give the path of a .pt checkpoint, of NAME.safetensors beside its NAME.yaml, or of an export"
-    return f"{absent} list` shows the models"
+    return f"{absent} show` shows the models"

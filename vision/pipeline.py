@@ -133,6 +133,7 @@ class Pipeline:
         obstacles_in: Callable[[Frame], ObstacleSectors | None] = lambda _: None,
         surfaces_in: SurfacesIn | None = None,
         clock_ns: Callable[[], int] = time.monotonic_ns,
+        tracker_stamp_ns: Callable[[Frame], int] = lambda frame: frame.captured_ns,
     ) -> None:
         """
         Args:
@@ -148,6 +149,7 @@ class Pipeline:
             surfaces_in: returns nearest points (N, 3) and middles (N,) of the objects in boxes (N, 4) of a
                 frame with depth, see `vision.depth.surfaces`; None: no ranges are measured.
             clock_ns: the clock of the frames' stamps, CLOCK_MONOTONIC nanoseconds.
+            tracker_stamp_ns: the tracker's time of a frame, nanoseconds; a recording may have its own time.
         """
         self._source = source
         self._detector = detector
@@ -163,6 +165,7 @@ class Pipeline:
         self._obstacles_in = obstacles_in
         self._surfaces_in = surfaces_in
         self._clock_ns = clock_ns
+        self._tracker_stamp_ns = tracker_stamp_ns
         self._newest = Detections.empty(detector.class_names if detector else ())
         self._next_sequence = 0
         self._missing = 0
@@ -232,7 +235,7 @@ class Pipeline:
         events: tuple[TrackEvent, ...] = ()
         if self._tracker is not None:
             view = self._view_at(frame)
-            tracked = self._tracker.update(detections, frame.captured_ns, view, frame.image)
+            tracked = self._tracker.update(detections, self._tracker_stamp_ns(frame), view, frame.image)
             if self.object_selection is not None:
                 tracked = self.object_selection.update(frame, tracked, view)
             detections, events = tracked.detections, tracked.events

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, plain_errors
+from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, plain_errors
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from companion.language.endpoints import Endpoint
     from companion.settings import Settings
 
-ASK_SETTINGS = ("zenoh", "vehicle.name", "language", "plugins")
+ASK_SETTINGS = (*CLIENT_SETTINGS, "language", "plugins")
 _BANNER = "ask, or say what to fly; `stop` stops at once, `cancel` ends an answer, `quit` the chat"
 
 
@@ -29,7 +29,6 @@ def ask(
     sentence: Annotated[
         str | None, typer.Argument(help='For example "find the red car and circle it". Without: a chat.')
     ] = None,
-    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
     serve: Annotated[
         bool, typer.Option("--serve", help="Answer what is asked on zenoh's key `ask`. Ends on Ctrl-C.")
     ] = False,
@@ -50,7 +49,7 @@ def ask(
         check_words("language.may", settings.language.may)
         endpoint = endpoint_from(settings.language)
         try:
-            done = asyncio.run(_converse(settings, endpoint, sentence, connect, serve=serve))
+            done = asyncio.run(_converse(settings, endpoint, sentence, serve=serve))
         except KeyboardInterrupt:
             done = serve
     if not done:
@@ -61,7 +60,6 @@ async def _converse(
     settings: Settings,
     endpoint: Endpoint | None,
     sentence: str | None,
-    connect: str | None,
     *,
     serve: bool = False,
 ) -> bool:
@@ -74,7 +72,7 @@ async def _converse(
     from companion.language.serve import ASK
     from companion.language.serve import serve as serve_queries
 
-    where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
+    where = client_settings(settings.zenoh).connect[0]
     terminal = Terminal()
     async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
 

@@ -1,4 +1,4 @@
-"""The command line of `companion bench detector|latency|setpoints|bus|deadman`."""
+"""The command line of `companion bench detector|latency|setpoints|deadman`."""
 
 from __future__ import annotations
 
@@ -8,35 +8,31 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from companion.cli.flags import plain_errors
+from companion.cli.flags import AsJson, Command, Device, ImageSize, Model, Threads, plain_errors
 
 bench = typer.Typer(help="Measure performance on this machine.", no_args_is_help=True)
 
-_JSON = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
-
-@bench.command("detector")
+@bench.command("detector", cls=Command)
 def bench_detector(
-    model: Annotated[str, typer.Option(help="Checkpoint or exported file.")] = "default",
+    model: Model = "default",
     runtime: Annotated[
         str | None,
         typer.Option(
             help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: all that run it."
         ),
     ] = None,
-    image_size: Annotated[
-        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
-    ] = 640,
+    image_size: ImageSize = 640,
     frame: Annotated[str, typer.Option(help="Image size, WIDTHxHEIGHT.")] = "640x480",
     frames: Annotated[int, typer.Option(min=5, help="Number of frames after a warm-up.")] = 100,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: the runtime's.")] = None,
+    threads: Threads = None,
     precision: Annotated[str, typer.Option(help="Precision: auto, float32, bfloat16 or float16.")] = "auto",
-    device: Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")] = "cpu",
+    device: Device = "cpu",
     classes: Annotated[
         str | None, typer.Option(help="Classes to detect: names or ids, comma separated. Default: all.")
     ] = None,
     against: Annotated[Path | None, typer.Option(help="Earlier --json result to compare with.")] = None,
-    as_json: _JSON = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the time per frame of each runtime. Prints milliseconds from pixels to boxes."""
     from companion.bench.detector import BenchError, measure_detectors, read_result, table
@@ -76,13 +72,13 @@ def bench_detector(
         typer.echo(line)
 
 
-@bench.command("latency")
+@bench.command("latency", cls=Command)
 def bench_latency(
     seconds: Annotated[
         float, typer.Option(min=1, help="Duration of the measurement in flight, seconds.")
     ] = 10.0,
     driver: Annotated[Literal["pymavlink", "mavsdk"], typer.Option(help="Driver.")] = "pymavlink",
-    as_json: _JSON = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the latency from frame to setpoint. Flies the simulated vehicle."""
     from companion.bench.latency import measure_latency
@@ -96,12 +92,12 @@ def bench_latency(
         _print_figures(measure_latency(seconds, driver=driver), as_json)
 
 
-@bench.command("setpoints")
+@bench.command("setpoints", cls=Command)
 def bench_setpoints(
     seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 10.0,
     rate_hz: Annotated[float, typer.Option(min=5, max=250, help="Setpoint rate, Hz.")] = 50.0,
     load: Annotated[int, typer.Option(min=0, help="Number of CPU-bound processes beside the loop.")] = 2,
-    as_json: _JSON = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure setpoint spacing under CPU load."""
     from companion.bench.setpoints import measure_setpoints
@@ -111,44 +107,10 @@ def bench_setpoints(
     _print_figures(figures, as_json)
 
 
-@bench.command("bus")
-def bench_bus(
-    seconds: Annotated[float, typer.Option(min=1, help="Duration of the measurement.")] = 10.0,
-    rate_hz: Annotated[float, typer.Option(min=1, max=1000, help="Messages a second.")] = 30.0,
-    load: Annotated[
-        int | None, typer.Option(min=0, help="Number of detectors that run beside it. Default: one per core.")
-    ] = None,
-    priority: Annotated[
-        Literal["low", "idle"], typer.Option(help="Priority of the detectors, as detector.priority.")
-    ] = "low",
-    recovered: Annotated[
-        int | None,
-        typer.Option(min=1, help="Instead publish this many messages of a recovered topic; count the lost."),
-    ] = None,
-    as_json: _JSON = False,
-) -> None:
-    """Measure the latency of zenoh under CPU load.
-
-    Measures the time from put to a subscriber in another process, while detectors use every core.
-    """
-    import os
-
-    from companion.bench.bus import measure_bus, measure_recovery
-    from companion.bus.session import BusError
-
-    with plain_errors(BusError, OSError, RuntimeError):
-        if recovered is not None:
-            figures = measure_recovery(recovered)
-        else:
-            detectors = len(os.sched_getaffinity(0)) if load is None else load
-            figures = measure_bus(seconds, rate_hz=rate_hz, load=detectors, priority=priority)
-    _print_figures(figures, as_json)
-
-
-@bench.command("deadman")
+@bench.command("deadman", cls=Command)
 def bench_deadman(
     runs: Annotated[int, typer.Option(min=1, help="Number of flights per fault, half a minute each.")] = 3,
-    as_json: _JSON = False,
+    as_json: AsJson = False,
 ) -> None:
     """Measure the reaction to process faults. Prints seconds until braking, stop and leaving OFFBOARD."""
     from rich.console import Console

@@ -1,21 +1,33 @@
-"""The command line of `companion calibrate`: of a lens (SOURCE), `mount` and `extrinsics`."""
+"""The command line of `companion calibrate`: of a lens or a depth camera (SOURCE), and `mount`."""
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import check_finite, check_folder, plain_errors, settings_command, with_default
+from companion.cli.flags import (
+    CLIENT_SETTINGS,
+    Command,
+    check_belonging,
+    check_finite,
+    check_folder,
+    plain_errors,
+    settings_command,
+    with_default,
+)
 from companion.host.journal import log_to_standard_error
 
 if TYPE_CHECKING:
     from companion.camera_tools.calibrate import Collected
     from companion.settings import Settings
+    from vision.calibration.boards import Board
+    from vision.sources import SourceSettings
 
 
 _ROTATE = Annotated[
@@ -30,6 +42,7 @@ _MARKER = Annotated[float | None, typer.Option(help="Side of a ChArUco board's m
 _DICTIONARY = Annotated[
     str | None, typer.Option(help="Dictionary of a ChArUco board's markers, such as 4X4_50.")
 ]
+_of_depth = functools.partial(typer.Option, rich_help_panel="A depth camera's pose (--depth-source)")
 _MIRROR = Annotated[bool, typer.Option("--mirror", help="Exchange left and right first, as source.mirror.")]
 
 calibrate = typer.Typer(
@@ -64,16 +77,23 @@ def _naming(missing: list[str]) -> Iterator[None]:
         _note(wanted)
 
 
-@calibrate.command()
+@calibrate.command(cls=Command)
 def lens(
+    context: typer.Context,
     source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
     board: _BOARD,
     square: _SQUARE,
     marker: _MARKER = None,
     dictionary: _DICTIONARY = None,
     output: Annotated[
-        Path, typer.Option("--output", "-o", help="Calibration file to write: ROS camera_info YAML.")
-    ] = Path("camera.yaml"),
+        Path | None,
+        typer.Option(
+            "--output",
+            "-o",
+            help="Calibration file to write: ROS camera_info YAML. Default: camera.yaml, of a depth camera "
+            "depth.yaml.",
+        ),
+    ] = None,
     report: Annotated[Path | None, typer.Option(help="Folder for a report: index.html and images.")] = None,
     name: Annotated[
         str | None,
@@ -89,111 +109,124 @@ def lens(
     ] = None,
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
+    depth_source: Annotated[
+        str | None,
+        _of_depth(
+            metavar="SOURCE",
+            help="Infrared images of the depth camera, taken at the same times; two folders are paired by "
+            "file name.",
+        ),
+    ] = None,
+    calibration: Annotated[Path | None, _of_depth(help="Calibration file of the colour camera.")] = None,
+    depth_calibration: Annotated[
+        Path | None, _of_depth(help="Calibration file of the infrared camera.")
+    ] = None,
 ) -> None:
-    """Calibrate a lens from images of a board.
+    """Calibrate a lens, or a depth camera's pose, from images of a board.
 
     Writes camera.yaml for camera.calibration_file. A live camera is read until the views are complete, or
-    until Ctrl-C.
+    until Ctrl-C. With --depth-source it measures the pose of a depth camera on the colour camera SOURCE, and
+    writes depth.yaml for source.depth_calibration_file: both see one board at the same time.
     """
-    from companion.camera_tools.calibrate import collect_views, result_lines, write_report
     from vision.calibration.boards import Board
-    from vision.calibration.calibrate import calibrate as calibrate_views
-    from vision.calibration_files.camera_info import camera_identity, write_camera_info
-    from vision.sources import SourceError, SourceSettings, open_source
+    from vision.sources import SourceError, SourceSettings
 
+    of_depth, of_lens = ("calibration", "depth_calibration"), ("report", "name", "width", "height")
+    check_belonging(context, "--depth-source SOURCE", of_depth, chosen=depth_source is not None)
+    check_belonging(context, "a lens, without --depth-source", of_lens, chosen=depth_source is None)
     log_to_standard_error(logging.WARNING, "companion: %(message)s")
-
     with plain_errors(SourceError, ValueError, OSError):  # CalibrationError is a ValueError
-        check_folder(output)
         printed = Board.parse(*board, square, marker, dictionary)
         settings = SourceSettings(
             width=width, height=height, every_frame=True, rotate_deg=rotate, mirror=mirror
         )
-        with open_source(source, settings) as frames:
-            collected = collect_views(frames, printed, _note, every)
-        with _naming(collected.collector.missing()):
-            result = calibrate_views(collected.collector.chosen())
-        _note(
-            f"{collected.frames} images, {collected.found} with the board, "
-            f"{len(collected.collector.views)} different views"
-        )
-        _note_pattern(collected)
-        for view, error in result.rejected:
-            _note(f"rejected {view.name}: its error is {error:.2f} px")
-        lines = result_lines(result)
-        notes = (f"companion calibrate: {lines[0]}", lines[3])
-        camera = name or camera_identity(source) or "camera"
-        write_camera_info(output, result.model, camera, notes, settings.orientation)
-        page = None if report is None else write_report(report, result, collected)
+        if depth_source is None:
+            _lens(source, printed, settings, output or Path("camera.yaml"), report, name, every)
+            return
+        if calibration is None or depth_calibration is None:
+            raise ValueError("--depth-source needs --calibration FILE and --depth-calibration FILE")
+        lenses = ((calibration, source), (depth_calibration, depth_source))
+        _depth_camera(lenses, printed, settings, output or Path("depth.yaml"), every)
+
+
+def _lens(
+    source: str,
+    printed: Board,
+    settings: SourceSettings,
+    output: Path,
+    report: Path | None,
+    name: str | None,
+    every: int,
+) -> None:
+    from companion.camera_tools.calibrate import collect_views, result_lines, write_report
+    from vision.calibration.calibrate import calibrate as calibrate_views
+    from vision.calibration_files.camera_info import camera_identity, write_camera_info
+    from vision.sources import open_source
+
+    check_folder(output)
+    with open_source(source, settings) as frames:
+        collected = collect_views(frames, printed, _note, every)
+    with _naming(collected.collector.missing()):
+        result = calibrate_views(collected.collector.chosen())
+    _note(
+        f"{collected.frames} images, {collected.found} with the board, "
+        f"{len(collected.collector.views)} different views"
+    )
+    _note_pattern(collected)
+    for view, error in result.rejected:
+        _note(f"rejected {view.name}: its error is {error:.2f} px")
+    lines = result_lines(result)
+    notes = (f"companion calibrate: {lines[0]}", lines[3])
+    camera = name or camera_identity(source) or "camera"
+    write_camera_info(output, result.model, camera, notes, settings.orientation)
+    page = None if report is None else write_report(report, result, collected)
     for line in lines:
         typer.echo(line)
     typer.echo(f"written: {output}" + ("" if page is None else f", {page}"))
 
 
-@calibrate.command()
-def extrinsics(
-    colour: Annotated[str, typer.Argument(help="Colour camera: folder of images, video, /dev/video0, …")],
-    infrared: Annotated[
-        str, typer.Argument(help="Infrared images of the depth camera, taken at the same times.")
-    ],
-    board: _BOARD,
-    square: _SQUARE,
-    colour_calibration: Annotated[Path, typer.Option(help="Calibration file of the colour camera.")],
-    infrared_calibration: Annotated[Path, typer.Option(help="Calibration file of the infrared camera.")],
-    marker: _MARKER = None,
-    dictionary: _DICTIONARY = None,
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help="Calibration file of the depth camera to write.")
-    ] = Path("depth.yaml"),
-    every: Annotated[int, typer.Option(min=1, help="Process every Nth frame of a video.")] = 1,
-    rotate: _ROTATE = 0,
-    mirror: _MIRROR = False,
+def _depth_camera(
+    lenses: tuple[tuple[Path, str], tuple[Path, str]],
+    printed: Board,
+    settings: SourceSettings,
+    output: Path,
+    every: int,
 ) -> None:
-    """Measure the pose of a depth camera on a colour camera.
-
-    Writes depth.yaml for source.depth_calibration_file. Both see one board at the same time. Two folders
-    are paired by file name.
-    """
+    """Measure the pose of a depth camera. `lenses`: calibration file and address of colour and infrared."""
     from companion.camera_tools.calibrate import collect_views, extrinsics_lines
-    from vision.calibration.boards import Board
     from vision.calibration.extrinsics import extrinsics_from_views
     from vision.calibration_files.camera_info import read_camera_info, write_camera_info
-    from vision.sources import SourceError, SourceSettings
     from vision.sources.opening import open_two
 
-    log_to_standard_error(logging.WARNING, "companion: %(message)s")
-    with plain_errors(SourceError, ValueError, OSError):
-        check_folder(output)
-        printed = Board.parse(*board, square, marker, dictionary)
-        settings = SourceSettings(every_frame=True, rotate_deg=rotate, mirror=mirror)
-        lenses = []
-        for file, uri in ((colour_calibration, colour), (infrared_calibration, infrared)):
-            (info := read_camera_info(file)).check_source(settings.orientation, uri=uri)
-            lenses.append(info.model)
-        first, second = open_two(colour, infrared, settings, settings)
-        with first, second:
-            collected = collect_views(first, printed, _note, every, second)
-        with _naming(collected.collector.missing()):
-            result = extrinsics_from_views(collected.pairs, *lenses)
-        views = len(collected.collector.views)
-        _note(
-            f"{collected.frames} pairs of images, {collected.found} with the board, {views} different views"
-        )
-        _note_pattern(collected)
-        for name, error in result.rejected:
-            _note(f"rejected {name}: its error is {error:.2f} px")
-        lines = extrinsics_lines(result)
-        notes = tuple(f"companion calibrate extrinsics: {line}" for line in lines)
-        calibration = result.calibration
-        write_camera_info(output, calibration.depth, "depth", notes, settings.orientation, calibration)
+    check_folder(output)
+    models = []
+    for file, uri in lenses:
+        (info := read_camera_info(file)).check_source(settings.orientation, uri=uri)
+        models.append(info.model)
+    (_, colour), (_, infrared) = lenses
+    first, second = open_two(colour, infrared, settings, settings)
+    with first, second:
+        collected = collect_views(first, printed, _note, every, second)
+    with _naming(collected.collector.missing()):
+        result = extrinsics_from_views(collected.pairs, *models)
+    views = len(collected.collector.views)
+    _note(f"{collected.frames} pairs of images, {collected.found} with the board, {views} different views")
+    _note_pattern(collected)
+    for name, error in result.rejected:
+        _note(f"rejected {name}: its error is {error:.2f} px")
+    lines = extrinsics_lines(result)
+    notes = tuple(f"companion calibrate lens: {line}" for line in lines)
+    calibration = result.calibration
+    write_camera_info(output, calibration.depth, "depth", notes, settings.orientation, calibration)
     for line in lines:
         typer.echo(line)
     typer.echo(f"written: {output}")
 
 
-@settings_command(calibrate, "zenoh", "vehicle.name")
+@settings_command(calibrate, *CLIENT_SETTINGS)
 def mount(
     settings: Settings,
+    given: Mapping[str, str],
     source: Annotated[str, typer.Argument(help="Folder of images, video, /dev/video0, shm://NAME or URL.")],
     marker: Annotated[int, typer.Option(min=0, help="Id of the marker, which lies level, face up.")],
     size: Annotated[float, typer.Option(help="Side of the marker's black square, metres.")],
@@ -212,7 +245,6 @@ def mount(
     live: Annotated[
         bool, typer.Option("--live", help="Take roll and pitch from the running service of vehicle.name.")
     ] = False,
-    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service, with --live.")] = None,
     frames: Annotated[int, typer.Option(min=1, help="Number of images with the marker.")] = 30,
     rotate: _ROTATE = 0,
     mirror: _MIRROR = False,
@@ -236,7 +268,7 @@ def mount(
     with plain_errors(SourceError, ValueError, OSError, NoAnswerError, BusError):
         if live and (roll or pitch):
             raise ValueError("--live replaces --roll and --pitch: leave them out")
-        if connect and not live:
+        if "zenoh.connect" in given and not live:
             raise ValueError("--connect is for --live")
         for flag, angle in (("--heading", heading), ("--roll", roll), ("--pitch", pitch)):
             check_finite(flag, angle)
@@ -247,19 +279,18 @@ def mount(
             info = read_camera_info(calibration)
             info.check_source(reading.orientation, uri=source)
             model = info.model
-        given = math.radians(roll), math.radians(pitch)
+        held = math.radians(roll), math.radians(pitch)
         with ExitStack() as opened:
             images = opened.enter_context(open_source(source, reading))
             if live and not images.live:
                 raise ValueError(f"--live needs a live source, got {source}: give --roll and --pitch")
             tilt = LiveTilt()
             if live:
-                client = client_settings(settings.zenoh, (connect,) if connect else ())
-                session = opened.enter_context(open_client(client))
+                session = opened.enter_context(open_client(client_settings(settings.zenoh)))
                 subscriber = listen(session, VEHICLE.key(settings.vehicle.name), tilt.on_message)
                 opened.callback(subscriber.undeclare)
             found, tilts = markers_of(
-                images, kind, marker, model, frames, _note, tilt if live else lambda: given
+                images, kind, marker, model, frames, _note, tilt if live else lambda: held
             )
         angles = mount_from_markers(found, math.radians(heading), *zip(*tilts, strict=True))
     typer.echo(f"# {angles.views} images, spread {math.degrees(angles.spread_rad):.2f} degrees")

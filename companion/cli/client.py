@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, plain_errors, say_silent
+from companion.cli.flags import EXIT_FAILED, YOLO, Limit, check_belonging, plain_errors, refuse, say_silent
 
 if TYPE_CHECKING:
     from companion.settings import Settings
+
+_COMMAND_TIMEOUT_S, _MISSION_TIMEOUT_S = 300.0, 3600.0
 
 
 def known_commands() -> str:
@@ -21,33 +23,90 @@ def known_commands() -> str:
 
 def send(
     settings: Settings,
+    context: typer.Context,
     command: Annotated[
-        str, typer.Argument(help='Command, for example "seek car" or "approach person distance=3".')
-    ],
-    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
-    timeout: Annotated[float, typer.Option(min=0.1, help="Seconds to wait for the outcome.")] = 300.0,
+        str | None, typer.Argument(help='Command, for example "seek car" or "approach person distance=3".')
+    ] = None,
+    file: Annotated[
+        str | None,
+        typer.Option(help="Instead of a command: mission file, or the name of a bundled one: demo."),
+    ] = None,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check",
+            help="With --file: only check it, including the detector's classes, and print the plan.",
+        ),
+    ] = False,
+    timeout: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="Seconds to wait for the outcome. Default: 300, of a mission 3600."),
+    ] = None,
 ) -> None:
-    """Send a command to a running service. Waits for its outcome."""
+    """Send a command or a mission to a running service. Waits for its outcome."""
     from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
     from companion.bus.session import BusError
+    from companion.guidance.missions.mission_file import MissionError
     from companion.operator.reply_text import reply_text
+    from companion.settings.plugins import PluginError
 
-    with plain_errors(NoAnswerError, BusError):
-        client = client_settings(settings.zenoh, (connect,) if connect else ())
-        with open_client(client) as session:
+    check_belonging(context, "--file", ("check",), chosen=file is not None)
+    if (command is None) == (file is None):
+        refuse("expected a command, such as companion send hold, or --file FILE, one of them")
+    limit_s = timeout or (_COMMAND_TIMEOUT_S if file is None else _MISSION_TIMEOUT_S)
+    with plain_errors(MissionError, NoAnswerError, BusError, PluginError, ValueError):
+        text = command if file is None else _mission_text(settings, file, check=check)
+        if text is None or check:
+            return
+        with open_client(client_settings(settings.zenoh)) as session:
             reply = send_command(
-                session, settings.vehicle.name, command, timeout_s=timeout, on_silent=say_silent
+                session, settings.vehicle.name, text, timeout_s=limit_s, on_silent=say_silent
             )
     typer.echo(reply_text(reply))
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)
 
 
+def _mission_text(settings: Settings, file: str, *, check: bool) -> str:
+    """Check a mission file and print its plan; returns the command that flies it.
+
+    Raises:
+        MissionError, PluginError, ValueError: what is wrong.
+    """
+    from companion.guidance.missions.mission_file import (
+        Mission,
+        describe,
+        find_mission,
+        plan_from,
+        read_mission,
+    )
+    from companion.settings.plugins import load_plugins
+
+    load_plugins(settings.plugins.modules)
+    text = read_mission(find_mission(file))
+    for line in describe(plan_from(text, file, _class_names(settings) if check else None)):
+        typer.echo(line)
+    # The text is sent along: the service may run on another computer.
+    return f"{Mission(file)}\n{text}"
+
+
+def _class_names(settings: Settings) -> tuple[str, ...] | None:
+    """Return the class names of the configured detector; None if it is disabled."""
+    if not settings.detector.enabled:
+        return None
+    if settings.detector.kind != YOLO:
+        from companion.perception.assembly import load_detector
+
+        return load_detector(settings).class_names
+    from vision.detector import class_names_of
+
+    return class_names_of(settings.detector.model, settings.detector.runtime)
+
+
 def echo(
     settings: Settings,
     key: Annotated[str, typer.Argument(help="Topic (labels), or zenoh key with wildcards.")] = "**",
-    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of messages.")] = None,
+    limit: Limit = None,
     history: Annotated[
         bool, typer.Option("--history", help="Begin with kept messages: events, tracks, status, camera_info.")
     ] = False,
@@ -61,17 +120,15 @@ def echo(
     messages: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
     with plain_errors(ValueError):
         check_topic(key)
-    with plain_errors(NoAnswerError, BusError):
-        client = client_settings(settings.zenoh, (connect,) if connect else ())
-        with open_client(client) as session:
-            subscriber = listen(session, key, lambda name, text: messages.put((name, text)), history=history)
-            try:
-                printed = 0
-                while limit is None or printed < limit:
-                    name, text = messages.get()
-                    print(f"{name} {text}", flush=True)
-                    printed += 1
-            except KeyboardInterrupt:
-                return
-            finally:
-                subscriber.undeclare()  # type: ignore[no-untyped-call]
+    with plain_errors(NoAnswerError, BusError), open_client(client_settings(settings.zenoh)) as session:
+        subscriber = listen(session, key, lambda name, text: messages.put((name, text)), history=history)
+        try:
+            printed = 0
+            while limit is None or printed < limit:
+                name, text = messages.get()
+                print(f"{name} {text}", flush=True)
+                printed += 1
+        except KeyboardInterrupt:
+            return
+        finally:
+            subscriber.undeclare()  # type: ignore[no-untyped-call]

@@ -12,12 +12,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
 
 import typer
 import typer.core
 import typer.main
 
+from companion.cli.former import former_line
 from companion.host.journal import marked_for_journal
 from companion.host.load import with_load
 from companion.host.passing import EXIT_PASSING, PassingError
@@ -26,6 +27,7 @@ from vision.gc_pause import gc_paused
 from vision.redaction import redacted
 
 if TYPE_CHECKING:
+    from companion.settings import Settings
     from companion.settings.reading import Flag
 
 # The settings load pydantic, numpy and OpenCV: they are imported when a command runs or shows its own help.
@@ -43,17 +45,53 @@ SHORT_NAMES = {
     "detector.model": "--model",
     "detector.classes": "--classes",
     "detector.confidence": "--confidence",
+    "detector.iou": "--iou",
+    "detector.image_size": "--image-size",
+    "detector.runtime": "--runtime",
+    "detector.precision": "--precision",
+    "detector.device": "--device",
+    "detector.threads": "--threads",
+    "zenoh.connect": "--connect",
     "vehicle.driver": "--driver",
     "recording.video": "--video",
     "log.level": "--log-level",
 }
 
-# The service alone does this; a command that takes the section `source` to read it must not accept it.
-_OF_THE_SERVICE = {"source.share"}
+# Parts of `detect` for which the lens of the camera is read.
+_WITH_LENS = ("level", "depth", "markers", "cloud")
+# A command that takes a whole section has other options for these: only the service shares frames; --tiles.
+_NOT_OF_SECTIONS = {"source.share", "detector.tiles"}
+# Settings of a client of a running service.
+CLIENT_SETTINGS = ("zenoh", "vehicle.name")
 
 # click's UsageError, through its public subclass: some versions of typer include their own click
 _UsageError: Any = typer.BadParameter.__base__
 
+# Options that several commands have.
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON: one object, or one per line.")]
+Model = Annotated[str, typer.Option(help="Checkpoint, exported file, or name in the models folder.")]
+ImageSize = Annotated[int, typer.Option(min=32, help="Longer side of the network's input, pixels.")]
+Iou = Annotated[
+    float | None,
+    typer.Option(min=0, max=1, help="NMS IoU threshold. Default: that of the model, else 0.7."),
+]
+Runtime = Annotated[
+    str | None,
+    typer.Option(
+        help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: that of the file, torch for "
+        "a checkpoint."
+    ),
+]
+Device = Annotated[str, typer.Option(help="Device of torch: cpu or cuda.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="CPU threads. Default: the runtime's.")]
+Tiles = Annotated[
+    bool, typer.Option("--tiles", help="Process large images in tiles too: small objects, much slower.")
+]
+TileSize = Annotated[
+    int | None, typer.Option(min=64, help="Side of a tile, pixels of the image. Default: --image-size.")
+]
+TileOverlap = Annotated[float, typer.Option(min=0, max=0.8, help="Overlap of tiles, fraction of a tile.")]
+Limit = Annotated[int | None, typer.Option(min=1, help="Maximum number of images or messages.")]
 Processes = Annotated[int, typer.Option(min=1, help="With --seeds: number of seeds at once.")]
 RayAddress = Annotated[
     str | None,
@@ -63,11 +101,52 @@ RayAddress = Annotated[
 ]
 
 
+class Command(typer.core.TyperCommand):
+    """A command whose options are grouped in its help, each group under its name, without rich.
+
+    An option of `optional_values` may be the last word, or stand before another option, without its value.
+    """
+
+    optional_values: tuple[str, ...] = ()
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Give the empty value to options whose value was left out."""
+        followed_by = (*args[1:], "--")
+        return super().parse_args(
+            ctx,
+            [
+                f"{word}=" if word in self.optional_values and after.startswith("-") else word
+                for word, after in zip(args, followed_by, strict=False)
+            ],
+        )
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments, then options by panel."""
+        panels: dict[str, list[Any]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            if record := parameter.get_help_record(ctx):
+                own = "Arguments" if parameter.param_type_name == "argument" else "Options"
+                panel = getattr(parameter, "rich_help_panel", None) or own
+                panels.setdefault(panel, []).append(record)
+        for name, records in panels.items():
+            if records:
+                with formatter.section(name):
+                    formatter.write_dl(records)
+
+
 class CompanionCommands(typer.core.TyperGroup):
-    """The commands. One without a setting names the new flag too if it is given the setting's former one.
+    """The commands. A former spelling is one line with the new one, and exit code 2.
+
+    One without a setting names the new flag too if it is given the setting's former one.
 
     What needs a module of an extra that is not installed says so in one line, and exits with code 2.
     """
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find the command that was given."""
+        if not ctx.resilient_parsing and (line := former_line(args)) is not None:
+            refuse(line)
+        return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         """Run the command that was given."""
@@ -131,6 +210,26 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         raise typer.Exit(EXIT_PASSING if isinstance(error, PassingError) else code) from error
 
 
+def refuse(text: str) -> NoReturn:
+    """Print one line on standard error, and exit with the code of bad input."""
+    typer.echo(f"companion: {text}", err=True)
+    raise typer.Exit(EXIT_BAD_INPUT)
+
+
+def given_options(context: typer.Context) -> set[str]:
+    """The names of the command's own parameters on the command line."""
+    sources = ((name, context.get_parameter_source(name)) for name in context.params)
+    return {name for name, source in sources if source is not None and source.name == "COMMANDLINE"}
+
+
+def check_belonging(context: typer.Context, what: str, names: Iterable[str], *, chosen: bool) -> None:
+    """Exit with code 2, naming it, if an option was given without what it is for."""
+    if chosen or not (misplaced := given_options(context) & set(names)):
+        return
+    flags = {each.name: max(each.opts, key=len) for each in context.command.params}
+    refuse(f"{flags[min(misplaced)]} is for {what}: give that too, or remove the option")
+
+
 def say_silent(text: str) -> None:
     """Print what is known of a service that is silent in the middle of a command; the command waits on."""
     typer.echo(f"companion: {text}", err=True)
@@ -163,22 +262,13 @@ def check_finite(flag: str, *values: float) -> None:
 
 def check_seed_options(context: typer.Context) -> None:
     """Exit with code 2 if a command's options do not fit together: --seed, --seeds and those for --seeds."""
+    given = given_options(context)
     for_seeds = {"as_json", "processes", "ray", "synthetic"}
-    given = {
-        name
-        for name in ("seed", "seeds", *for_seeds)
-        if (source := context.get_parameter_source(name)) is not None and source.name == "COMMANDLINE"
-    }
-    refused = None
-    if "seeds" not in given and (alone := given & for_seeds):
-        refused = f"--{min(alone).removeprefix('as_')} is for many seeds: add --seeds, such as --seeds 1..8"
-    elif {"seed", "seeds"} <= given:
-        refused = "--seed and --seeds were given: give one of them"
-    elif {"processes", "ray"} <= given:
-        refused = "--processes and --ray were given: a cluster decides how many seeds run at once"
-    if refused is not None:
-        typer.echo(f"companion: {refused}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT)
+    check_belonging(context, "many seeds, such as --seeds 1..8", for_seeds, chosen="seeds" in given)
+    if {"seed", "seeds"} <= given:
+        refuse("--seed and --seeds were given: give one of them")
+    if {"processes", "ray"} <= given:
+        refuse("--processes and --ray were given: a cluster decides how many seeds run at once")
 
 
 def check_folder(path: Path) -> None:
@@ -188,26 +278,31 @@ def check_folder(path: Path) -> None:
 
 
 def settings_command(
-    app: typer.Typer, *keys: str, epilog: Callable[[], str] = lambda: ""
+    app: typer.Typer,
+    *keys: str,
+    epilog: Callable[[], str] = lambda: "",
+    optional_values: tuple[str, ...] = (),
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a function as a command of `app` that takes `--config` and settings as flags.
 
-    The function's first parameter, `settings`, receives the validated settings. An optional parameter `given`
-    receives the flags that were set, key → text. All other parameters are the command's own.
+    The function's first parameter, `settings`, receives the validated settings; `read_settings` instead of it
+    a function that reads them. Optional parameters are `given`, the flags that were set, key → text, and
+    `context`. All others are the command's own.
 
     Args:
         keys: the settings that are flags, by key (`vehicle.name`) or by section (`zenoh`); none: all.
-        epilog: returns the text after the help, with its line breaks.
+        epilog: returns the text after the help, with its line breaks. optional_values: see `Command`.
     """
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
-        kind = type("_WithSettings", (_WithSettings,), {"keys": keys, "make_epilog": staticmethod(epilog)})
+        own = {"keys": keys, "make_epilog": staticmethod(epilog), "optional_values": optional_values}
+        kind = type("_WithSettings", (_WithSettings,), own)
         return app.command(cls=kind)(_given_settings(command, keys))
 
     return register
 
 
-class _WithSettings(typer.core.TyperCommand):
+class _WithSettings(Command):
     """A command whose settings flags are created on use: for all commands together they are hundreds."""
 
     keys: tuple[str, ...] = ()
@@ -242,20 +337,23 @@ def _given_settings(command: Callable[..., None], keys: tuple[str, ...]) -> Call
 
         given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
-        # The command's own SOURCE, if it is read with camera's lens; `preview` needs that for --level alone.
-        with_lens = "camera" in keys and values.get("level", True)
-        with plain_errors(ConfigurationError):
-            settings = load_settings(
-                config_file, overrides, read_uri=values.get("source") if with_lens else None
-            )
-        if "given" in own.parameters:
-            values["given"] = overrides
-        command(settings, **values)
+        # The command's own SOURCE, if it is read with the camera's lens.
+        with_lens = any(values.get(part) not in (None, False) for part in _WITH_LENS)
+
+        def read_settings() -> Settings:
+            with plain_errors(ConfigurationError):
+                return load_settings(
+                    config_file, overrides, read_uri=values.get("source") if with_lens else None
+                )
+
+        offered = {"given": overrides, "context": context}
+        values |= {name: value for name, value in offered.items() if name in own.parameters}
+        command(read_settings if "read_settings" in own.parameters else read_settings(), **values)
 
     parameters = [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in own.parameters.items()
-        if name not in ("settings", "given")
+        if name not in ("settings", "read_settings", "given", "context")
     ]
     parameters.append(
         _option("config_file", Path | None, "--config", help="Settings file. Default: ./companion.toml.")
@@ -285,7 +383,7 @@ def _flags_by_parameter(keys: tuple[str, ...]) -> dict[str, Flag]:
         for flag in flags()
         if not keys
         or flag.key in wanted
-        or (flag.key.partition(".")[0] in wanted and flag.key not in _OF_THE_SERVICE)
+        or (flag.key.partition(".")[0] in wanted and flag.key not in _NOT_OF_SECTIONS)
     ]
     # Former names are hidden flags: using one is reported with all other errors of the settings.
     taken = {flag.key for flag in chosen}
@@ -310,7 +408,7 @@ def _setting_parameters(keys: tuple[str, ...]) -> list[Any]:
         names = [_flag_of(flag.key)]
         if short := SHORT_NAMES.get(flag.key):
             names.insert(0, short)
-        panel = flag.key.partition(".")[0]
+        panel = f"Settings of [{flag.key.partition('.')[0]}]"
         parameters.append(
             _option(
                 name,

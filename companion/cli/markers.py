@@ -1,29 +1,20 @@
-"""The command line of `companion markers`: `detect` (SOURCE) and `print`."""
+"""The command line of `companion markers`: sheets of markers to print."""
 
 from __future__ import annotations
 
-import builtins
-import functools
-import logging
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, check_folder, plain_errors, settings_command, with_default
-from companion.host.journal import log_to_standard_error
+from companion.cli.flags import check_folder, plain_errors
 from vision.gc_pause import gc_paused
 
 if TYPE_CHECKING:
     from companion.settings import Settings
     from companion.settings.perception import MarkersSection
 
-markers = typer.Typer(
-    cls=with_default("detect"),
-    help="Detect printed markers, or print them.\n\n"
-    "`companion markers SOURCE` is `companion markers detect SOURCE`.",
-    no_args_is_help=True,
-)
 _DICTIONARY = Annotated[
     str | None, typer.Option(help="Dictionary: 4X4_50, tag36h11. Default: markers.dictionary.")
 ]
@@ -32,55 +23,10 @@ _SIZE = Annotated[
 ]
 
 
-@settings_command(markers, "camera", "markers.others", "markers.boards_file", "markers.print")
-def detect(
-    settings: Settings,
-    source: Annotated[
-        str, typer.Argument(help="File, folder, /dev/video0, FIFO, - (standard input), shm:// or URL.")
-    ],
-    dictionary: _DICTIONARY = None,
-    size: _SIZE = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")] = None,
-    width: Annotated[
-        int | None, typer.Option(min=16, help="Width of raw frames or a camera, pixels.")
-    ] = None,
-    height: Annotated[int | None, typer.Option(min=16, help="Height of the same, pixels.")] = None,
-    pixel_format: Annotated[str | None, typer.Option(help="Pixel format: bgr24, gray8, YUYV…")] = None,
-    save: Annotated[Path | None, typer.Option(help="Folder for annotated images.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per frame.")] = False,
-) -> None:
-    """Print the markers in the frames of a source.
-
-    With range, bearing, pose and their one-sigma errors. Directions and poses are in the body frame
-    (forward, right, down), as the camera is mounted.
-    """
-    with gc_paused():
-        from companion.camera_tools.markers import print_markers
-        from vision.sources import SourceError, SourceSettings, open_source
-
-    log_to_standard_error(logging.WARNING, "companion: %(message)s")
-    with plain_errors(ValueError):
-        section = _section(settings.markers, dictionary, size)
-        if settings.camera.on_gimbal:
-            raise ValueError("camera.on_gimbal: without a vehicle the gimbal's attitude is unknown; unset it")
-        reading = SourceSettings(width=width, height=height, pixel_format=pixel_format, every_frame=True)
-    # ValueError: the lens is of images of another aspect.
-    with plain_errors(SourceError, OSError, ValueError), open_source(source, reading) as frames:
-        frames_read = print_markers(
-            frames,
-            settings.model_copy(update={"markers": section}),
-            limit=limit,
-            save=save,
-            as_json=as_json,
-            write=functools.partial(builtins.print, flush=True),
-        )
-    if not frames_read:
-        typer.echo(f"companion: {source}: contains no frames", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT)
+MARKER_SETTINGS = ("markers.others", "markers.boards_file", "markers.map_file", "markers.print")
 
 
-@settings_command(markers, "markers.others", "markers.boards_file", "markers.map_file", "markers.print")
-def print(
+def markers(
     settings: Settings,
     identifiers: Annotated[str, typer.Argument(metavar="IDS", help="Ids of the markers: 0..9 or 3,7.")],
     dictionary: _DICTIONARY = None,
@@ -104,6 +50,11 @@ def print(
         check_folder(output)
         kind = _section(settings.markers, dictionary, size).kind()
         assert kind is not None
+        if not re.match(r"\d", identifiers):
+            raise ValueError(
+                f"IDS must be numbers such as 0..9 or 3,7, got {identifiers!r}; markers in the images of a "
+                "source: companion detect SOURCE --model none --markers"
+            )
         wanted = numbers_of(identifiers, "ids", markers_in(kind.dictionary) - 1)
         output.write_bytes(marker_sheets(kind, wanted, paper_of(paper)))
     typer.echo(f"written: {output}, {len(wanted)} markers")

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import plain_errors
+from companion.cli.flags import CLIENT_SETTINGS, plain_errors
 
 if TYPE_CHECKING:
     from companion.dashboard.access import Access
     from companion.settings import Settings
 
-MCP_SETTINGS = ("zenoh", "vehicle.name", "plugins")
+MCP_SETTINGS = (*CLIENT_SETTINGS, "plugins")
 
 
 def mcp(
@@ -33,7 +33,6 @@ def mcp(
     token_file: Annotated[
         Path | None, typer.Option(help="File with the token of the clients; required with --listen.")
     ] = None,
-    connect: Annotated[str | None, typer.Option(help="Zenoh endpoint of the service or its router.")] = None,
 ) -> None:
     """Serve commands and state to language models (MCP).
 
@@ -55,7 +54,7 @@ def mcp(
         check_words("--allow", allowed, for_models=True)
         access = None if listen is None else _access(listen, token_file)
         try:
-            asyncio.run(_serve(settings, allowed, listen, access, connect))
+            asyncio.run(_serve(settings, allowed, listen, access))
         except KeyboardInterrupt:
             return
 
@@ -77,16 +76,14 @@ def _access(listen: str, token_file: Path | None) -> Access:
     return Access(host, read_token(token_file, "--token-file"), page=False)
 
 
-async def _serve(
-    settings: Settings, allowed: list[str], listen: str | None, access: Access | None, connect: str | None
-) -> None:
+async def _serve(settings: Settings, allowed: list[str], listen: str | None, access: Access | None) -> None:
     from companion.bus.client import client_settings
     from companion.client import connect as connect_to
     from companion.dashboard.server import Guard, http_server, listening_socket, split_listen
     from companion.language.live import LiveVehicle
     from companion.language.mcp_server import PATH, FlightTools, http_app, serve_stdio, server_of
 
-    where = client_settings(settings.zenoh, (connect,) if connect else ()).connect[0]
+    where = client_settings(settings.zenoh).connect[0]
     async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
         camera = (await drone.query("config"))["guidance"]["camera"]
         vehicle = LiveVehicle(drone, (), camera)

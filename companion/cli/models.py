@@ -1,22 +1,28 @@
-"""The command line of `companion models list|info|pull|export|verify`."""
+"""The command line of `companion models show|pull|export`."""
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
 from companion.cli.download import pull_named
-from companion.cli.flags import plain_errors
+from companion.cli.flags import (
+    EXIT_FAILED,
+    AsJson,
+    Command,
+    ImageSize,
+    Runtime,
+    check_belonging,
+    plain_errors,
+)
 
-if TYPE_CHECKING:
-    pass
+models = typer.Typer(help="List, inspect, compare, download and export models.", no_args_is_help=True)
 
-models = typer.Typer(help="List, inspect, download, export and verify models.", no_args_is_help=True)
-
-_JSON = Annotated[bool, typer.Option("--json", help="Print JSON.")]
+_of_comparison = functools.partial(typer.Option, rich_help_panel="Comparison (--compare)")
 _FOLDER = Annotated[
     Path | None,
     typer.Option(
@@ -26,9 +32,57 @@ _FOLDER = Annotated[
 ]
 
 
-@models.command("list")
-def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
-    """List bundled, local and official models."""
+@models.command(cls=Command)
+def show(
+    context: typer.Context,
+    file: Annotated[
+        str | None,
+        typer.Argument(
+            help="Checkpoint, exported file, `default`, or name in the models folder. Without: the bundled, "
+            "local and official models."
+        ),
+    ] = None,
+    folder: _FOLDER = None,
+    image_size: ImageSize = 640,
+    runtime: Runtime = None,
+    compare: Annotated[
+        str | None,
+        _of_comparison(
+            metavar="EXPORT",
+            help="Compare this file from `companion models export` with FILE, a checkpoint. Exit code 1 if "
+            "they differ.",
+        ),
+    ] = None,
+    images: Annotated[
+        Path | None, _of_comparison(help="Folder of images to compare on. Default: rendered scenes.")
+    ] = None,
+    count: Annotated[int, _of_comparison(min=1, help="Number of images.")] = 8,
+    map_tolerance: Annotated[float, _of_comparison(min=0, help="Tolerance of raw maps, logits.")] = 0.02,
+    box_tolerance: Annotated[float, _of_comparison(min=0, help="Tolerance of box sides, pixels.")] = 0.5,
+    threads: Annotated[int | None, _of_comparison(min=1, help="CPU threads.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the models, or show what a file is.
+
+    Of a file: family, classes, GFLOPs at the image size, licence, runtime and precision; with --compare
+    whether an exported model gives the same boxes.
+    """
+    of_compare = ("images", "count", "map_tolerance", "box_tolerance", "threads")
+    check_belonging(context, "--compare EXPORT", of_compare, chosen=compare is not None)
+    check_belonging(context, "a FILE", ("image_size", "runtime", "compare"), chosen=file is not None)
+    check_belonging(context, "the list, without FILE", ("folder",), chosen=file is None)
+    check_belonging(context, "one FILE, without --compare", ("runtime",), chosen=compare is None)
+    if file is None:
+        _list(folder, as_json=as_json)
+    elif compare is None:
+        _describe(file, image_size, runtime, as_json=as_json)
+    else:
+        tolerances = (map_tolerance, box_tolerance)
+        _compare(file, compare, images, count, image_size, tolerances, threads, as_json=as_json)
+
+
+def _list(folder: Path | None, *, as_json: bool) -> None:
+    """The bundled, local and official models."""
     from companion.models.info import list_rows
     from vision.model_files import models_folders
 
@@ -47,22 +101,8 @@ def list_models(folder: _FOLDER = None, as_json: _JSON = False) -> None:
         )
 
 
-@models.command()
-def info(
-    file: Annotated[
-        str, typer.Argument(help="Checkpoint, exported file, `default`, or name in the models folder.")
-    ],
-    image_size: Annotated[int, typer.Option(min=32, help="Image size for the GFLOPs, pixels.")] = 640,
-    runtime: Annotated[
-        str | None,
-        typer.Option(
-            help="Runtime: torch, onnxruntime, openvino, tensorrt or auto. Default: that of the file, "
-            "torch for a checkpoint."
-        ),
-    ] = None,
-    as_json: _JSON = False,
-) -> None:
-    """Describe a model file. Prints family, classes, GFLOPs, licence, runtime and precision."""
+def _describe(file: str, image_size: int, runtime: str | None, *, as_json: bool) -> None:
+    """What a model file is."""
     from companion.models.export_info import export_info, export_lines
     from companion.models.info import info_lines, model_info
     from vision.detector import model_path
@@ -86,10 +126,41 @@ def info(
         typer.echo(line)
 
 
-@models.command()
+def _compare(
+    source: str,
+    exported: str,
+    images: Path | None,
+    count: int,
+    image_size: int,
+    tolerances: tuple[float, float],
+    threads: int | None,
+    *,
+    as_json: bool,
+) -> None:
+    """Compare an exported model with its source. Exits with code 1 if they differ."""
+    from companion.models.verify import parity_lines, sample_images, verify
+    from vision.model_files import find_model
+    from vision.runtimes.base import RuntimeUnusableError
+    from vision.yolo.checkpoint_error import CheckpointError
+
+    with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
+        samples = sample_images(images, count)
+        parity = verify(_checkpoint(source), find_model(exported), samples, image_size, threads=threads)
+    holds = parity.holds(*tolerances)
+    if as_json:
+        typer.echo(json.dumps({**parity.plain(), "holds": holds}))
+    else:
+        for line in parity_lines(parity, *tolerances):
+            typer.echo(line)
+        typer.echo("equivalent" if holds else "NOT equivalent")
+    if not holds:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@models.command(cls=Command)
 def pull(
     name: Annotated[
-        str, typer.Argument(help="Model name, for example yolov8n; see `companion models list`.")
+        str, typer.Argument(help="Model name, for example yolov8n; see `companion models show`.")
     ],
     folder: _FOLDER = None,
     url: Annotated[str | None, typer.Option(help="Mirror URL of the same file.")] = None,
@@ -101,7 +172,7 @@ def pull(
     )
 
 
-@models.command()
+@models.command(cls=Command)
 def export(
     file: Annotated[str, typer.Argument(help="Checkpoint, `default`, or name in the models folder.")],
     to: Annotated[str, typer.Option(help="Format: onnx, openvino, tensorrt or torchscript.")],
@@ -111,9 +182,7 @@ def export(
             help="Output file. Default: beside the checkpoint; of the bundled model in the models folder."
         ),
     ] = None,
-    image_size: Annotated[
-        int, typer.Option(min=32, help="Image size for tuning and checking, pixels.")
-    ] = 640,
+    image_size: ImageSize = 640,
     precision: Annotated[
         str, typer.Option(help="Precision: float32, or int8 with --calibrate (onnx and openvino).")
     ] = "float32",
@@ -147,42 +216,6 @@ def export(
             calibrate=calibrate,
         )
     typer.echo(f"{written} ({written.stat().st_size} bytes), for --model")
-
-
-@models.command()
-def verify(
-    source: Annotated[str, typer.Argument(help="Checkpoint.")],
-    exported: Annotated[str, typer.Argument(help="File from `companion models export`.")],
-    images: Annotated[
-        Path | None, typer.Option(help="Folder of images to compare on. Default: rendered scenes.")
-    ] = None,
-    count: Annotated[int, typer.Option(min=1, help="Number of images.")] = 8,
-    image_size: Annotated[
-        int, typer.Option(min=32, help="Longer side of the network's input, pixels.")
-    ] = 640,
-    map_tolerance: Annotated[float, typer.Option(min=0, help="Tolerance of raw maps, logits.")] = 0.02,
-    box_tolerance: Annotated[float, typer.Option(min=0, help="Tolerance of box sides, pixels.")] = 0.5,
-    threads: Annotated[int | None, typer.Option(min=1, help="CPU threads.")] = None,
-    as_json: _JSON = False,
-) -> None:
-    """Compare an exported model with its source. Exit code 1 if they differ."""
-    from companion.models.verify import parity_lines, sample_images, verify
-    from vision.model_files import find_model
-    from vision.runtimes.base import RuntimeUnusableError
-    from vision.yolo.checkpoint_error import CheckpointError
-
-    with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):
-        samples = sample_images(images, count)
-        parity = verify(_checkpoint(source), find_model(exported), samples, image_size, threads=threads)
-    holds = parity.holds(map_tolerance, box_tolerance)
-    if as_json:
-        typer.echo(json.dumps({**parity.plain(), "holds": holds}))
-    else:
-        for line in parity_lines(parity, map_tolerance, box_tolerance):
-            typer.echo(line)
-        typer.echo("equivalent" if holds else "NOT equivalent")
-    if not holds:
-        raise typer.Exit(1)
 
 
 def _checkpoint(model: str) -> Path:

@@ -1,7 +1,8 @@
-"""The command line of `companion view`: the service without a vehicle, for its page."""
+"""The command line of `companion view`: the page of a source, or of a running service."""
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import re
@@ -14,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.download import Pull
-from companion.cli.flags import EXIT_BAD_INPUT
+from companion.cli.flags import plain_errors, refuse
 from companion.cli.run import after_pull, run_service
 
 if TYPE_CHECKING:
@@ -25,21 +26,36 @@ def view(
     settings: Settings,
     given: Mapping[str, str],
     source: Annotated[
-        str, typer.Argument(help="File, folder, /dev/video0, csi://0, FIFO, - (standard input) or URL.")
-    ],
+        str | None,
+        typer.Argument(
+            help="File, folder, /dev/video0, csi://0, FIFO, - (standard input) or URL. Without: the page "
+            "of a running service."
+        ),
+    ] = None,
     pull: Pull = False,
 ) -> None:
-    """Show a source live in the browser, with its detections.
+    """Show a source, or a running service, live in the browser.
 
-    Without a vehicle; the rest is as companion run: topics on zenoh, recording, several cameras. A file is
-    repeated.
+    A source is shown with its detections. It has no vehicle; the rest is as companion run: topics on zenoh,
+    recording, several cameras. A file is repeated. Without SOURCE the page is that of the service which
+    --connect reaches, at --dashboard-listen. Ctrl-C ends it.
     """
     from companion.settings.perception import NO_SOURCE
     from companion.settings.vehicle import NO_VEHICLE
 
-    if (refused := _refused(settings, given, is_none=source == NO_SOURCE)) is not None:
-        typer.echo(f"companion: {refused}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT)
+    if not settings.dashboard.listen:
+        refuse("dashboard.listen is empty: view shows the page; set it to HOST:PORT such as 127.0.0.1:8088")
+    if "source.uri" in given:
+        refuse("source.uri: view takes the source without a flag: companion view SOURCE")
+    if source is None:
+        if pull:
+            refuse("--pull is for a source, and none is given: companion view SOURCE --pull")
+        _serve_page(settings)
+        return
+    if "vehicle.url" in given:
+        refuse("vehicle.url: view has no vehicle; use companion run --source SOURCE --vehicle-url URL")
+    if source == NO_SOURCE:
+        refuse("view none: expected a source to show")
     loop = settings.source.loop or ("source.loop" not in given and settings.source.depth is None)
     shown = settings.source.model_copy(update={"uri": source, "loop": loop})
     vehicle = settings.vehicle.model_copy(update={"url": NO_VEHICLE})
@@ -47,16 +63,29 @@ def view(
     run_service(after_pull(settings) if pull else settings, _open_page)
 
 
-def _refused(settings: Settings, given: Mapping[str, str], *, is_none: bool) -> str | None:
-    if "source.uri" in given:
-        return "source.uri: view takes the source without a flag: companion view SOURCE"
-    if "vehicle.url" in given:
-        return "vehicle.url: view has no vehicle; use companion run --source SOURCE --vehicle-url URL"
-    if is_none:
-        return "view none: expected a source to show"
-    if not settings.dashboard.listen:
-        return "dashboard.listen is empty: view shows the page; set it to HOST:PORT such as 127.0.0.1:8088"
-    return None
+def _serve_page(settings: Settings) -> None:
+    """Serve the page of a running service until Ctrl-C."""
+    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.config import BusError
+    from companion.dashboard.access import DashboardError
+    from companion.dashboard.server import NICENESS, DashboardOptions, serve
+
+    with plain_errors(NoAnswerError, DashboardError, BusError):
+        options = DashboardOptions(
+            settings.dashboard.listen,
+            settings.dashboard.token_file,
+            client_settings(settings.zenoh),
+            settings.vehicle.name,
+            settings.language,
+            settings.plugins.modules,
+        )
+        os.nice(NICENESS)
+        try:
+            asyncio.run(
+                serve(options, lambda url: print(f"dashboard: {url}", flush=True), "--dashboard-listen")
+            )
+        except KeyboardInterrupt:
+            return
 
 
 def _open_page(line: str) -> None:

@@ -101,7 +101,7 @@ def usage(kind: type[Command]) -> str:
 def summary() -> str:
     """Every command in two lines: syntax and help."""
     lines = [f"  {usage(kind)}\n      {kind.help}" for kind in COMMANDS.values()]
-    return "\n".join(["Commands (arguments: `companion commands`; plug-ins add more):", *lines])
+    return "\n".join(["Commands (arguments: `companion describe commands`; plug-ins add more):", *lines])
 
 
 def describe() -> str:

@@ -1,7 +1,7 @@
 """Policy files: an ONNX network from an observation to an action, with a description of both.
 
 The network has one input, (1, observations) float32, and one output, (1, actions) float32, both in the units
-of the description, which is JSON in the file's metadata under `KEY`. `companion train-policy` writes them.
+of the description, which is JSON in the file's metadata under `KEY`. `companion learn train` writes them.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def load_policy(path: Path) -> LoadedPolicy:
     if text is None:
         raise PolicyError(
             f"{path}: has no description of its observation and action (metadata {KEY}); "
-            "train it with `companion train-policy`"
+            "train it with `companion learn train --policy`"
         )
     try:
         description = PolicyDescription.model_validate_json(text)

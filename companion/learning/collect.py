@@ -1,4 +1,4 @@
-"""`companion collect`: frames in which the detector was in doubt, as a data set to label.
+"""`companion learn collect`: frames in which the detector was in doubt, as a data set to label.
 
 Such frames teach a detector most. Each is labelled with the model's own boxes, to be corrected by hand.
 """
@@ -110,7 +110,9 @@ class LabelFolder:
             table = load_plain_yaml(self._text)
             names = table.get("names") if isinstance(table, dict) else None
             if not isinstance(names, list):
-                raise ValueError(f"{self._file}: expected a list `names`, as `companion collect` writes it")
+                raise ValueError(
+                    f"{self._file}: expected a list `names`, as `companion learn collect` writes it"
+                )
             self._names = [str(name) for name in names]
             self._splits = {split: table[split] for split in ("train", "val") if table.get(split)}
             self._check_splits(folder / str(table.get("path") or ""))

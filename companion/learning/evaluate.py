@@ -1,4 +1,4 @@
-"""`companion evaluate`: score a detector on a labelled data set, per class, and show its worst misses."""
+"""`companion learn evaluate`: score a detector on a labelled data set, per class, with its worst misses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`companion train`: train the bundled detector from this repository, or any one on labelled images.
+"""`companion learn train`: train the bundled detector from this repository, or any one on labelled images.
 
 For the bundled one the recipe (`vision.training.recipe`) and the scenes
 (`mavlink_sim.datasets.training_scenes`) determine the weights; nothing is downloaded. On labelled images a
@@ -179,7 +179,7 @@ def train_on_data(
     beside the output as `<output>.training`, for `resume`.
 
     Args:
-        data: as for `companion evaluate`; the split `train` if it has splits.
+        data: as for `companion learn evaluate`; the split `train` if it has splits.
         start: the model to train: `default`, a file, or a name in the models folder.
         validation: a data set to score on; None: the split `val` of `data`, or without one the training
             images.

@@ -1,4 +1,4 @@
-"""`companion train-policy`: train a policy in an environment of `mavlink_sim.environments`, and write it.
+"""`companion learn train --policy`: a policy, trained in an environment of `mavlink_sim.environments`.
 
 The algorithms are those of Stable-Baselines3 (extra `learn`). The network sees the observation normalized by
 its running mean and deviation, and acts in -1..1; both scalings become part of the written file. The same

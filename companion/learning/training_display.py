@@ -1,4 +1,4 @@
-"""Progress on standard error of `companion train` and `companion train-policy`."""
+"""Progress on standard error of `companion learn train`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`companion replay`: step guidance again over recorded inputs, compare its outputs with the recorded ones.
+"""`companion log replay`: step guidance again over recorded inputs, and compare its outputs.
 
 `Guidance.step` is a function of its inputs: without a change every output is equal, bit for bit, on the same
 processor, Python and library versions. With a model its targets are made again from the recorded images

@@ -1,4 +1,4 @@
-"""`companion replay --model`: detector, tracker and ranging again over the recorded images and their depth.
+"""`companion log replay --model`: detector, tracker and ranging again over the recorded images.
 
 The same functions as in the service make targets of the images; `Guidance.step` gets them in the step in
 which it got those of the flight. JPEG images are those of the preview: at most `preview.rate_hz`, and scaled

@@ -1,4 +1,4 @@
-"""`companion sightings`: the objects in a recording, as GeoJSON (RFC 7946) or KML 2.2."""
+"""`companion log show --objects`: the objects in a recording, as GeoJSON (RFC 7946) or KML 2.2."""
 
 from __future__ import annotations
 

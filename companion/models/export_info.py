@@ -1,4 +1,4 @@
-"""`companion models info` of an exported file, ours or another exporter's, and of a YOLOX checkpoint."""
+"""`companion models show` of an exported file, ours or another exporter's, and of a YOLOX checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`companion models list` and `info`: the available models, and the description of a model file."""
+"""`companion models show`: the available models, and the description of a model file."""
 
 from __future__ import annotations
 

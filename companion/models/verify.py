@@ -1,4 +1,4 @@
-"""`companion models verify`: compare the outputs of an exported model with its source on sample images."""
+"""`companion models show --compare`: an exported model and its source on sample images."""
 
 from __future__ import annotations
 

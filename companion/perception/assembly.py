@@ -50,18 +50,19 @@ class CameraTelemetry:
 def build_pipeline(
     settings: Settings,
     source: Source,
-    detector: ObjectDetector | None,
+    detector: FrameDetector | None,
     telemetry: CameraTelemetry,
     *,
     recorder: FrameRecorder | None = None,
     first_track_id: int = 1,
     clock_ns: Callable[[], int] = time.monotonic_ns,
+    tracker_stamp_ns: Callable[[Frame], int] = lambda frame: frame.captured_ns,
 ) -> Pipeline:
     """Build the pipeline of the settings.
 
     Args:
         source: open. detector: from `load_detector`; None if detection is disabled.
-        clock_ns: the clock of the frames' stamps.
+        clock_ns: the clock of the frames' stamps. tracker_stamp_ns: as of `Pipeline`.
     """
     return Pipeline(
         source,
@@ -74,6 +75,7 @@ def build_pipeline(
         obstacles_in=_obstacles_in(settings, telemetry),
         surfaces_in=_surfaces_in(settings, telemetry),
         clock_ns=clock_ns,
+        tracker_stamp_ns=tracker_stamp_ns,
     )
 
 
@@ -101,7 +103,7 @@ def build_path_planning(settings: Settings, telemetry: CameraTelemetry) -> PathP
     )
 
 
-def tiled(settings: Settings, detector: ObjectDetector | None) -> FrameDetector | None:
+def tiled(settings: Settings, detector: FrameDetector | None) -> FrameDetector | None:
     """Wrap the detector for tiling if the settings enable it."""
     section = settings.detector
     if detector is None or not section.tiles:

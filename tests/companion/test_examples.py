@@ -116,7 +116,7 @@ def test_commands_find_the_square_and_classes_of_the_plugins(tmp_path: Path) -> 
     missions = []
     for name in ("blob", "car"):
         (tmp_path / f"{name}.toml").write_text(f"[[step]]\ndo = 'takeoff 3'\n[[step]]\ndo = 'seek {name}'\n")
-        missions.append(("mission", f"{name}.toml", "--check", *kind))
+        missions.append(("send", "--file", f"{name}.toml", "--check", *kind))
     (code, output, errors), *checks = run_commands(detect, *missions, cwd=tmp_path)
     assert code == 0, errors
     # The warning of the bundled model is about the built-in kind: the summary alone.

@@ -124,7 +124,13 @@ def refusing() -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    "command", [["preview"], ["config", "--source"], ["view", "--source"], ["config", "--check", "--source"]]
+    "command",
+    [
+        ["detect", "--model", "none"],
+        ["describe", "settings", "--source"],
+        ["view", "--source"],
+        ["describe", "settings", "--check", "--source"],
+    ],
 )
 def test_commands_show_no_secret(refusing: str, command: list[str], tmp_path: Path) -> None:
     for address in (refusing, *ADDRESSES[2:5]):

@@ -239,7 +239,7 @@ def test_network_is_trained_and_written(pool: Pool, tmp_path: Path) -> None:
     assert (written.metadata["steps_done"], written.metadata["scenes"]) == (1, 8)
     assert written.metadata["learning_rate"] == 1e-3
     assert written.metadata["steps_of_width_height_batch"] == [[320, 256, 5], [320, 256, 5], [640, 480, 1]]
-    # What `companion models info` shows of the bundled weights is what this tool writes.
+    # What `companion models show` shows of the bundled weights is what this tool writes.
     bundled = load_checkpoint(DEFAULT_WEIGHTS).metadata
     assert written.metadata.keys() <= bundled.keys()
     same = (

@@ -232,7 +232,7 @@ def test_missing_model_is_a_one_line_error(tmp_path: Path) -> None:
 
 def test_missing_bundled_model_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(detector_module, "DEFAULT_EXPORT", tmp_path / "default.onnx")
-    with pytest.raises(CheckpointError, match=r"companion train"):
+    with pytest.raises(CheckpointError, match=r"companion learn train"):
         Detector()
 
 

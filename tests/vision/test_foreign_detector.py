@@ -431,7 +431,7 @@ def test_damaged_openvino_file_is_refused_without_openvino(
     (tmp_path / "g.xml").write_bytes(head + np.random.default_rng(0).bytes(2000))
     (tmp_path / "g.bin").write_bytes(bytes(64))
     (tmp_path / "metadata.yaml").write_text("names: {0: car}\nstride: 32\n")
-    result = CliRunner().invoke(app, ["models", "info", str(tmp_path)])
+    result = CliRunner().invoke(app, ["models", "show", str(tmp_path)])
     assert result.exit_code == 2
     assert f"{tmp_path / 'g.xml'}: " in result.stderr
     assert "OpenVINO model: " in result.stderr

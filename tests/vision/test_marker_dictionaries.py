@@ -72,7 +72,7 @@ def test_every_place_that_names_a_dictionary_reads_all_names(tmp_path: Path) -> 
     (plate,) = scene.world.objects
     assert plate.printed is not None
     assert plate.printed.dictionary == name
-    words = ("markers", "print", "3", "--dictionary", given, "--size", "0.1", "-o", "markers.pdf")
+    words = ("markers", "3", "--dictionary", given, "--size", "0.1", "-o", "markers.pdf")
     assert companion_here(*words, cwd=tmp_path).returncode == 0
     assert name.encode() in (tmp_path / "markers.pdf").read_bytes()
 
@@ -80,7 +80,7 @@ def test_every_place_that_names_a_dictionary_reads_all_names(tmp_path: Path) -> 
 def test_wrong_name_in_a_scene_or_setting_names_its_key(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"plates\[0\].dictionary.*known: "):
         parse_scene('[[plates]]\ndictionary = "8X8"\nid = 3\nsize_m = 0.5\nplace_m = [1.0, 2.0]\n')
-    done = companion_here("config", "--markers-dictionary", "tag36h12", cwd=tmp_path)
+    done = companion_here("describe", "settings", "--markers-dictionary", "tag36h12", cwd=tmp_path)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert "markers.dictionary" in line

@@ -274,7 +274,7 @@ def test_file_of_each_kind_does_what_the_table_says(tmp_path: Path, kind: str) -
         else:
             assert len(found) > 0
         return
-    refused = CliRunner().invoke(app, ["models", "info", str(path)])
+    refused = CliRunner().invoke(app, ["models", "show", str(path)])
     assert refused.exit_code == 2
     (line,) = refused.stderr.splitlines()
     assert result.strip("`") in line

@@ -43,7 +43,7 @@ class CameraInfo:
         model: size, camera matrix and distortion.
         name: of the camera; None if it has none, or a program's default.
         orientation: how the images were turned before the calibration; None if the file does not say.
-        registration: of a depth camera to its colour camera, as `companion calibrate extrinsics` writes it.
+        registration: of a depth camera to its colour camera, as `companion calibrate lens` writes it.
     """
 
     path: Path

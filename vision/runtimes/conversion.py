@@ -163,7 +163,7 @@ def _check(network: Network, facts: ExportedFacts, to: ExportKind, path: Path) -
         except (RuntimeError, RuntimeUnusableError) as error:
             raise _mismatch(to, image.shape, str(error)) from error
         worst = _largest_difference(expected, found)
-        # Half precision rounds every layer; `companion models verify` compares the boxes.
+        # Half precision rounds every layer; `companion models show --compare` compares the boxes.
         if not worst <= (_TOLERANCE if runtime.precision == "float32" else 50 * _TOLERANCE):
             raise _mismatch(to, image.shape, f"largest difference {worst:.3g}")
 

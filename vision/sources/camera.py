@@ -144,7 +144,7 @@ def _unopened(device: Path) -> str:
         return f"it is busy: {', '.join(held_by)} has it open"
     return (
         "it does not open as a camera; another user's program may be using it, or it is a camera's metadata "
-        "node (see `companion cameras`)"
+        "node (see `companion describe cameras`)"
     )
 
 

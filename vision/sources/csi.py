@@ -115,7 +115,7 @@ def parse_csi_number(uri: str) -> int:
     """The camera's number in `csi://N`. Raises SourceError."""
     number = uri.partition("://")[2]
     if not (number.isascii() and number.isdecimal()):
-        raise SourceError(f"{uri}: expected csi://NUMBER, for example csi://0 (see `companion cameras`)")
+        raise SourceError(f"{uri}: expected csi://NUMBER (see `companion describe cameras`)")
     return int(number)
 
 

@@ -157,7 +157,7 @@ class PairedCapture(Capture):
             raise SourceError(
                 f"{self._depth.uri}: depth is {depth_m.shape[1]}x{depth_m.shape[0]}, the image "
                 f"{frame.width}x{frame.height}: depth must be registered to the colour image and have its "
-                f"size, or source.depth_calibration_file must be set (companion calibrate extrinsics)"
+                "size, or source.depth_calibration_file must be set (companion calibrate lens --depth-source)"
             )
         self._paired = True
         return depth_m

@@ -1,9 +1,9 @@
 """The body of every message as a type: the public contract with subscribers. Fields are added, never changed.
 
-JSON Schema and the tables of `companion topics` are made of these types. They cost nothing when a message is
-published: a body is a plain dict. Stamps are CLOCK_MONOTONIC nanoseconds of the publishing computer; frames,
-quaternions (w, x, y, z) and vectors are as in `companion.vehicle.state`. Boxes are pixels: left, top, right,
-bottom.
+JSON Schema and the tables of `companion describe topics` are made of these types. They cost nothing when a
+message is published: a body is a plain dict. Stamps are CLOCK_MONOTONIC nanoseconds of the publishing
+computer; frames, quaternions (w, x, y, z) and vectors are as in `companion.vehicle.state`. Boxes are pixels:
+left, top, right, bottom.
 """
 
 from __future__ import annotations

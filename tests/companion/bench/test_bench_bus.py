@@ -1,4 +1,4 @@
-"""`companion bench bus`: what it counts and that nothing is lost on a recovered topic."""
+"""The benchmark of the bus: what it counts and that nothing is lost on a recovered topic."""
 
 from __future__ import annotations
 
@@ -12,12 +12,11 @@ from typing import Any
 
 import pytest
 
-from companion.bench.bus import _LOADING_S, _START_S, _detections, measure_bus, measure_recovery
+from benchmarks.bus import _LOADING_S, _START_S, _detections, main, measure_bus, measure_recovery
 from companion.host.scheduling import DEFAULT_NS, set_scheduler_slice
 from companion.perception.process import PerceptionProcess
 from companion.settings import Settings
 from tests.companion.bus.message_check import check_message
-from tests.companion.command_line import companion_here
 
 pytestmark = pytest.mark.realtime
 
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.realtime
 # More than the command's own limits: its workers, its subscriber's process, its subscription.
 @pytest.mark.timeout(_LOADING_S + 3 * _START_S)
 def test_delay_to_another_process_is_measured(
-    exported_model: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exported_model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     spawn = PerceptionProcess.spawn
 
@@ -38,13 +37,12 @@ def test_delay_to_another_process_is_measured(
         return await spawn(changed, standard_input)
 
     monkeypatch.setattr(PerceptionProcess, "spawn", spawn_with_one_hertz)
-    command = ("bench", "bus", "--seconds", "1", "--rate-hz", "1000", "--load", "1", "--json")
+    monkeypatch.setattr(sys, "argv", ["bus", "--seconds", "1", "--rate-hz", "1000", "--load", "1"])
     try:
-        printed = companion_here(*command, cwd=tmp_path)
+        main()
     finally:
         set_scheduler_slice(DEFAULT_NS)
-    assert printed.returncode == 0, printed.stderr
-    figures = json.loads(printed.stdout)
+    figures = json.loads(capsys.readouterr().out)
     assert figures["published"] == 1000
     assert 0 < figures["received"] <= 1000
     # Some messages are late, and the next ones with them.
@@ -74,12 +72,12 @@ def test_worker_ends_if_the_next_one_cannot_start(monkeypatch: pytest.MonkeyPatc
         os.kill(started[0].pid, 0)
 
 
-def test_subscriber_that_does_not_start_ends_the_command(tmp_path: Path) -> None:
+def test_subscriber_that_does_not_start_ends_the_command() -> None:
     """The process ends, with one line: no thread of an open session keeps it."""
-    program = "from companion.bench import bus; bus._START_S = 0.001; from companion.cli import main; main()"
+    program = "from benchmarks import bus; bus._START_S = 0.001; bus.main()"
     done = subprocess.run(
-        [sys.executable, "-c", program, "bench", "bus", "--load", "0"],
-        cwd=tmp_path,
+        [sys.executable, "-c", program, "--load", "0"],
+        cwd=Path(__file__).parents[3],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

@@ -88,10 +88,10 @@ def test_schema_files(tmp_path: Path) -> None:
 
 
 def test_topics_on_the_command_line(tmp_path: Path) -> None:
-    printed = companion_here("topics", "--json", cwd=tmp_path)
+    printed = companion_here("describe", "topics", "--json", cwd=tmp_path)
     assert [json.loads(line) for line in printed.stdout.splitlines()] == topic_table()
-    assert companion_here("topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
-    listed = companion_here("topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
+    assert companion_here("describe", "topics", "--markdown", cwd=tmp_path).stdout == topics_markdown()
+    listed = companion_here("describe", "topics", "--schema", tmp_path / "schemas", cwd=tmp_path)
     assert len(listed.stdout.splitlines()) == len(ALL_TOPICS)
-    plain = companion_here("topics", cwd=tmp_path).stdout
+    plain = companion_here("describe", "topics", cwd=tmp_path).stdout
     assert all(topic.name in plain for topic in ALL_TOPICS)

@@ -101,7 +101,7 @@ def test_folder_gives_a_calibration_and_a_report(folder: Path, tmp_path: Path) -
     for file in files:
         assert cv2.imread(str(report / file)) is not None
     assert all(f"view{number:02d}.png" in page for number in range(12))
-    done = CliRunner().invoke(app, ["config", "--camera-calibration-file", str(output)])
+    done = CliRunner().invoke(app, ["describe", "settings", "--camera-calibration-file", str(output)])
     assert done.exit_code == 0, done.output
     assert f'calibration_file = "{output}"' in done.stdout
 
@@ -140,10 +140,10 @@ def test_calibration_of_turned_images_says_so(few: Path, marker_images: Path, tm
     assert calibrate(few, *BOARD_WORDS, "-o", output, "--rotate", "180", "--mirror").exit_code == 0
     assert {"rotate_deg: 180", "mirror: true"} <= set(output.read_text().splitlines())
     flags = ("--camera-calibration-file", str(output))
-    done = CliRunner().invoke(app, ["config", *flags])
+    done = CliRunner().invoke(app, ["describe", "settings", *flags])
     assert "source.rotate_deg is 0" in one_line_of_bad_input(done)
     turned = ("--source-rotate-deg", "180", "--source-mirror", "true")
-    assert CliRunner().invoke(app, ["config", *flags, *turned]).exit_code == 0
+    assert CliRunner().invoke(app, ["describe", "settings", *flags, *turned]).exit_code == 0
     done = calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", "--calibration", output)
     assert "rotate_deg" in one_line_of_bad_input(done)
 
@@ -167,8 +167,8 @@ def first_pairs(pairs: Path, count: int, path: Path) -> tuple[Path, Path]:
 
 def extrinsics(pairs: Path, *options: str | Path, **files: Path) -> Result:
     lenses = {"colour": pairs / "colour.yaml", "infrared": pairs / "depth.yaml"} | files
-    words = [word for name, file in lenses.items() for word in (f"--{name}-calibration", file)]
-    return calibrate("extrinsics", pairs / "colour", pairs / "infrared", *BOARD_WORDS, *words, *options)
+    sources = (pairs / "colour", "--depth-source", pairs / "infrared")
+    return calibrate(*sources, *BOARD_WORDS, *_lenses(lenses["colour"], lenses["infrared"]), *options)
 
 
 def test_folders_of_two_cameras_give_their_places(pairs: Path, tmp_path: Path) -> None:
@@ -188,8 +188,8 @@ def test_folders_of_two_cameras_give_their_places(pairs: Path, tmp_path: Path) -
     assert right is not None
     assert float(right[1]) == pytest.approx(true.position_m[0] * 1000, abs=2.0)
     flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(output))
-    assert CliRunner().invoke(app, ["config", *flags]).exit_code == 0
-    turned = CliRunner().invoke(app, ["config", *flags, "--source-mirror", "true"])
+    assert CliRunner().invoke(app, ["describe", "settings", *flags]).exit_code == 0
+    turned = CliRunner().invoke(app, ["describe", "settings", *flags, "--source-mirror", "true"])
     assert "mirror" in one_line_of_bad_input(turned)
 
 
@@ -202,17 +202,18 @@ def test_wrong_files_of_two_cameras_are_refused(pairs: Path, few: Path, tmp_path
     line = one_line_of_bad_input(extrinsics(tmp_path, "-o", tmp_path / "depth.yaml", **lenses))
     assert "640x360" in line
     assert "280x210" in line
-    words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
-    line = one_line_of_bad_input(calibrate("extrinsics", pairs / "colour", few, *BOARD_WORDS, *words))
+    words = ("--depth-source", few, *_lenses(pairs / "colour.yaml", pairs / "depth.yaml"))
+    line = one_line_of_bad_input(calibrate(pairs / "colour", *BOARD_WORDS, *words))
     assert "not determine" in line
     empty = ("--board", "chessboard", "8x5", "--square", "0.03")
-    line = one_line_of_bad_input(calibrate("extrinsics", *folders, *empty, *words))
+    words = ("--depth-source", folders[1], *_lenses(pairs / "colour.yaml", pairs / "depth.yaml"))
+    line = one_line_of_bad_input(calibrate(folders[0], *empty, *words))
     assert "no board " in line
     assert " of 2 pairs" in line
     flags = ("--source-depth", "depth/", "--source-depth-calibration-file", str(pairs / "colour.yaml"))
-    done = CliRunner().invoke(app, ["config", *flags])
+    done = CliRunner().invoke(app, ["describe", "settings", *flags])
     assert "colour_from_depth" in one_line_of_bad_input(done)
-    done = CliRunner().invoke(app, ["config", *flags[2:]])
+    done = CliRunner().invoke(app, ["describe", "settings", *flags[2:]])
     assert "set depth" in one_line_of_bad_input(done)
 
 
@@ -312,9 +313,9 @@ def test_too_few_views(folder: Path, tmp_path: Path) -> None:
 
 
 def test_too_few_pairs(pairs: Path, tmp_path: Path) -> None:
-    folders = first_pairs(pairs, 5, tmp_path)
-    words = ("--colour-calibration", pairs / "colour.yaml", "--infrared-calibration", pairs / "depth.yaml")
-    done = calibrate("extrinsics", *folders, *BOARD_WORDS, *words, "-o", tmp_path / "depth.yaml")
+    colour, infrared = first_pairs(pairs, 5, tmp_path)
+    words = ("--depth-source", infrared, *_lenses(pairs / "colour.yaml", pairs / "depth.yaml"))
+    done = calibrate(colour, *BOARD_WORDS, *words, "-o", tmp_path / "depth.yaml")
     line = one_line_of_bad_input(done)
     assert done.stderr.splitlines() == [line]
     assert "few views" in line
@@ -331,24 +332,25 @@ def test_calibration_of_another_camera_is_refused(folder: Path, tmp_path: Path) 
     size, words = ("--size", "0.6"), ("--calibration", file)
     for refused in (
         calibrate("mount", other, "--marker", "7", *size, *words),
-        calibrate("extrinsics", other, "infrared", *BOARD_WORDS, *_lenses(file, folder / "truth.yaml")),
-        calibrate("extrinsics", "colour", other, *BOARD_WORDS, *_lenses(folder / "truth.yaml", file)),
-        CliRunner().invoke(app, ["markers", other, "--dictionary", "4X4_50", *size, *flags]),
-        CliRunner().invoke(app, ["config", "--source", other, *flags]),
+        calibrate(other, "--depth-source", "infrared", *BOARD_WORDS, *_lenses(file, folder / "truth.yaml")),
+        calibrate("colour", "--depth-source", other, *BOARD_WORDS, *_lenses(folder / "truth.yaml", file)),
+        CliRunner().invoke(app, ["detect", other, "--markers", "4X4_50", *flags]),
+        CliRunner().invoke(app, ["describe", "settings", "--source", other, *flags]),
     ):
         line = one_line_of_bad_input(refused)
         assert own in line
         assert other in line
     for fits in (("--source", own, "--source-name", "front"), ("--source", "/dev/video0")):
-        assert CliRunner().invoke(app, ["config", *fits, *flags]).exit_code == 0
+        assert CliRunner().invoke(app, ["describe", "settings", *fits, *flags]).exit_code == 0
 
 
+# By name: command and options.
 _READERS = {
-    "preview": (),
-    "depth": (),
-    "markers": ("--dictionary", "4X4_50", "--size", "0.6"),
-    "cloud": ("cloud.ply",),
-    "calibrate mount": ("--marker", "7", "--size", "0.6"),
+    "status": ("detect", "--model", "none"),
+    "depth": ("detect", "--model", "none", "--depth"),
+    "markers": ("detect", "--model", "none", "--markers", "4X4_50"),
+    "cloud": ("detect", "--model", "none", "--cloud", "cloud.ply"),
+    "mount": ("calibrate", "mount", "--marker", "7", "--size", "0.6"),
 }
 
 
@@ -378,7 +380,7 @@ def test_source_of_the_service_is_read_by_a_command(
     reader: str, source: str, settings: str, opened: list[str]
 ) -> None:
     Path("companion.toml").write_text(settings)
-    done = CliRunner().invoke(app, [*reader.split(), source, *_READERS[reader]])
+    done = CliRunner().invoke(app, [*_READERS[reader], source])
     assert opened == [source], done.output
 
 
@@ -390,9 +392,9 @@ def test_lens_must_fit_the_source_that_is_read(opened: list[str]) -> None:
         Path("companion.toml").write_text(
             f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"'
         )
-        assert own in one_line_of_bad_input(CliRunner().invoke(app, [reader, other, *_READERS[reader]]))
+        assert own in one_line_of_bad_input(CliRunner().invoke(app, [*_READERS[reader], other]))
         Path("companion.toml").write_text(f'[source]\nuri = "{other}"')
-        CliRunner().invoke(app, [reader, own, *_READERS[reader], *lens])
+        CliRunner().invoke(app, [*_READERS[reader], own, *lens])
     assert opened == [own] * 3
 
 
@@ -400,15 +402,15 @@ def test_command_that_uses_no_lens_reads_another_camera(opened: list[str]) -> No
     own, other = "/dev/v4l/by-id/usb-front-video-index0", "/dev/v4l/by-id/usb-rear-video-index0"
     write_camera_info(Path("camera.yaml"), LENS, own)
     Path("companion.toml").write_text(f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"')
-    for reader in ("preview", "calibrate mount"):
-        CliRunner().invoke(app, [*reader.split(), other, *_READERS[reader]])
+    for reader in ("status", "mount"):
+        CliRunner().invoke(app, [*_READERS[reader], other])
     assert opened == [other] * 2
-    levelled = CliRunner().invoke(app, ["preview", other, "--level", "--save", "images"])
+    levelled = CliRunner().invoke(app, [*_READERS["status"], other, "--level", "--save", "images"])
     assert own in one_line_of_bad_input(levelled)
 
 
 def _lenses(colour: Path, infrared: Path) -> tuple[str | Path, ...]:
-    return ("--colour-calibration", colour, "--infrared-calibration", infrared)
+    return ("--calibration", colour, "--depth-calibration", infrared)
 
 
 def test_address_of_one_camera_is_its_name(

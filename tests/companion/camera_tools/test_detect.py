@@ -1,23 +1,24 @@
-"""Tracks in `companion detect`."""
+"""`companion detect` of boxes: tracks, lines, images."""
 
 import json
 import os
 import shutil
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from companion.camera_tools.detect import detect_source, make_save_folder
+from companion.camera_tools.detect import Boxes, Output, Summary, detect_source, make_save_folder
+from companion.perception.assembly import CameraTelemetry
+from companion.settings.reading import load_settings
 from vision.annotate import annotate
 from vision.detections import Detections
 from vision.object_detector import Timing
 from vision.sources import open_source
-from vision.tracking import Tracker, TrackerSettings
 
 pytestmark = pytest.mark.realtime
 
@@ -56,13 +57,19 @@ def two_squares(tmp_path: Path) -> Path:
     return path
 
 
-def tracks_of(path: Path, **options: Any) -> list[list[dict[str, Any]]]:
-    lines: list[str] = []
+def detected(path: Path, lines: list[str] | None = None, *, track: bool = False, **output: Any) -> Summary:
+    """Detect white areas in a source; `lines` are printed."""
+    settings = load_settings(os.devnull, {"tracker.enabled": str(track).lower()}, {})
+    where = Output(write=(list[str]() if lines is None else lines).append, **output)
     with open_source(str(path)) as source:
-        tracker = Tracker(TrackerSettings())
-        detect_source(
-            source, WhiteBlobDetector(), as_json=True, tracker=tracker, write=lines.append, **options
-        )
+        parts = [Boxes(tracked=track, ranged=False)]
+        detector = cast(Any, WhiteBlobDetector())
+        return detect_source(source, settings, detector, parts, where, CameraTelemetry())
+
+
+def tracks_of(path: Path) -> list[list[dict[str, Any]]]:
+    lines: list[str] = []
+    detected(path, lines, track=True, as_json=True)
     return [json.loads(line)["detections"] for line in lines]
 
 
@@ -81,18 +88,14 @@ def test_objects_keep_ids_and_a_later_one_gets_a_new_id(two_squares: Path) -> No
 
 def test_text_lines_show_id_and_confirmation(two_squares: Path) -> None:
     lines: list[str] = []
-    with open_source(str(two_squares)) as source:
-        detect_source(
-            source, WhiteBlobDetector(), limit=6, tracker=Tracker(TrackerSettings()), write=lines.append
-        )
+    detected(two_squares, lines, track=True, limit=6)
     assert "blob 0.90 #1?, blob 0.90 #2?" in lines[0]
     assert "blob 0.90 #1, blob 0.90 #2" in lines[-1] or "blob 0.90 #2, blob 0.90 #1" in lines[-1]
 
 
 def test_without_tracker_there_are_no_track_fields(two_squares: Path) -> None:
     lines: list[str] = []
-    with open_source(str(two_squares)) as source:
-        detect_source(source, WhiteBlobDetector(), limit=2, as_json=True, write=lines.append)
+    detected(two_squares, lines, limit=2, as_json=True)
     records = [record for line in lines for record in json.loads(line)["detections"]]
     assert len(records) == 4
     assert not any(key.startswith("track_") for record in records for key in record)
@@ -102,8 +105,7 @@ def test_lines_name_the_video_and_its_time(two_squares: Path) -> None:
     text: list[str] = []
     lines: list[str] = []
     for as_json, written in ((False, text), (True, lines)):
-        with open_source(str(two_squares)) as source:
-            detect_source(source, WhiteBlobDetector(), limit=3, as_json=as_json, write=written.append)
+        detected(two_squares, written, limit=3, as_json=as_json)
     assert [line.split()[:2] for line in text] == [
         ["squares.avi", time] for time in ("0.000", "0.200", "0.400")
     ]
@@ -114,8 +116,7 @@ def test_lines_name_the_video_and_its_time(two_squares: Path) -> None:
 
 
 def test_summary_counts_frames_and_objects(two_squares: Path) -> None:
-    with open_source(str(two_squares)) as source:
-        summary = detect_source(source, WhiteBlobDetector(), limit=5, write=lambda line: None)
+    summary = detected(two_squares, limit=5)
     assert summary.frames == 5
     assert summary.objects == {"blob": 10}
     assert str(summary).startswith("5 frames, ")
@@ -130,8 +131,7 @@ def test_saved_images_keep_their_names(two_squares: Path, tmp_path: Path) -> Non
     make_save_folder(saved, str(photos))
     lines: list[str] = []
     for path, limit in ((photos, None), (two_squares, 1)):
-        with open_source(str(path)) as source:
-            detect_source(source, WhiteBlobDetector(), limit=limit, save=saved, write=lines.append)
+        detected(path, lines, limit=limit, save=saved)
     names = ["boat.jpg", "boat.png", "squares_000000.jpg"]
     assert sorted(path.name for path in saved.iterdir() if path.is_file()) == names
     assert sorted(path.name for path in (saved / "detections").iterdir()) == names
@@ -147,8 +147,7 @@ def test_names_that_are_not_utf8_or_have_line_ends_are_escaped_and_saved(tmp_pat
         (photos / name).write_bytes(image)
     make_save_folder(saved, str(photos))
     lines: list[str] = []
-    with open_source(str(photos)) as source:
-        detect_source(source, WhiteBlobDetector(), save=saved, write=lines.append)
+    detected(photos, lines, save=saved)
     assert [line.split()[0] for line in lines] == [r"caf\udce9.png", r"two\nlines.png"]
     assert sorted(path.name for path in (saved / "detections").iterdir()) == names
 
@@ -156,11 +155,8 @@ def test_names_that_are_not_utf8_or_have_line_ends_are_escaped_and_saved(tmp_pat
 def test_image_that_cannot_be_written_is_named(two_squares: Path, tmp_path: Path) -> None:
     make_save_folder(tmp_path / "saved", str(two_squares))
     shutil.rmtree(tmp_path / "saved")
-    with (
-        open_source(str(two_squares)) as source,
-        pytest.raises(OSError, match=f"cannot write {tmp_path}/saved/"),
-    ):
-        detect_source(source, WhiteBlobDetector(), save=tmp_path / "saved", write=list[str]().append)
+    with pytest.raises(OSError, match=f"cannot write {tmp_path}/saved/"):
+        detected(two_squares, save=tmp_path / "saved")
 
 
 def test_save_folder_of_the_source_or_that_is_a_file_is_refused(two_squares: Path) -> None:

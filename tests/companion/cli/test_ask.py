@@ -107,9 +107,10 @@ async def service() -> AsyncIterator[Service]:
 
 async def ask(there: Service, sentence: str | None, **changes: str) -> bool:
     settings = plain_settings(
-        {"vehicle.name": "vehicle"} | {key.replace("__", "."): value for key, value in changes.items()}
+        {"vehicle.name": "vehicle", "zenoh.connect": there.endpoint}
+        | {key.replace("__", "."): value for key, value in changes.items()}
     )
-    return await _converse(settings, None, sentence, there.endpoint)
+    return await _converse(settings, None, sentence)
 
 
 @contextmanager
@@ -257,8 +258,9 @@ async def test_zenoh_questions_are_answered_and_fly_what_is_allowed(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     async with service() as there:
-        settings = plain_settings({"vehicle.name": "vehicle", "language.may": "takeoff,orbit"})
-        serving = asyncio.create_task(_converse(settings, None, None, there.endpoint, serve=True))
+        changes = {"zenoh.connect": there.endpoint, "language.may": "takeoff,orbit"}
+        settings = plain_settings({"vehicle.name": "vehicle"} | changes)
+        serving = asyncio.create_task(_converse(settings, None, None, serve=True))
         await shown("answering companion/vehicle/ask", capsys)
         async with connect(there.endpoint) as drone:
 

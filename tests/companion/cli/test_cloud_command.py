@@ -1,4 +1,4 @@
-"""`companion cloud`: files, view, JSON, and one line for bad input."""
+"""`companion detect --cloud`: files, view, JSON, and one line for bad input."""
 
 from __future__ import annotations
 
@@ -49,12 +49,13 @@ def shared(frame: Frame, mount: CameraMount = DEFAULT_MOUNT) -> Iterator[None]:
         yield
 
 
-def run(*arguments: str | Path) -> Any:
-    return CliRunner().invoke(app, ["cloud", *map(str, arguments)])
+def run(source: str | Path, output: Path, *options: str | Path) -> Any:
+    words = ["detect", source, "--model", "none", "--cloud", output, *options]
+    return CliRunner().invoke(app, list(map(str, words)))
 
 
-def refused(*arguments: str | Path) -> str:
-    result = run(*arguments)
+def refused(source: str | Path, output: Path, *options: str | Path) -> str:
+    result = run(source, output, *options)
     assert result.exit_code == 2, result.output
     (line,) = result.stderr.splitlines()
     assert line.startswith("companion: ")
@@ -84,11 +85,11 @@ def test_the_file_has_all_pixels_in_the_body_frame(frame: Frame, tmp_path: Path)
 
 def test_frame_and_attitude_turn_the_points(frame: Frame, tmp_path: Path) -> None:
     with shared(frame):
-        common = ("--voxel", "0.2", "--text")
-        assert run(URI, tmp_path / "camera.pcd", "--frame", "camera", *common).exit_code == 0
+        common = ("--voxel", "0.2", "--cloud-text")
+        assert run(URI, tmp_path / "camera.pcd", "--cloud-frame", "camera", *common).exit_code == 0
         assert (
             run(
-                URI, tmp_path / "ned.pcd", "--frame", "ned", "--attitude", "0", "-10", "90", *common
+                URI, tmp_path / "ned.pcd", "--cloud-frame", "ned", "--attitude", "0", "-10", "90", *common
             ).exit_code
             == 0
         )
@@ -105,12 +106,14 @@ def test_frame_and_attitude_turn_the_points(frame: Frame, tmp_path: Path) -> Non
 def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> None:
     view = tmp_path / "cloud.png"
     with shared(frame):
-        result = run(URI, tmp_path / "cloud.ply", "--clusters", "--json", "--view", view)
+        result = run(URI, tmp_path / "cloud.ply", "--clusters", "--json", "--cloud-view", view)
     assert result.exit_code == 0, result.output
     assert result.stderr == ""
     report = json.loads(result.stdout)
-    assert set(report) == {"source", "file", "frame", "stamp_ns", "points", "clusters"}
-    assert (report["source"], report["frame"]) == (URI, "body")
+    assert set(report) == {"sequence", "captured_ns", "width", "height", "cloud"}
+    report = report["cloud"]
+    assert set(report) == {"file", "frame", "points", "clusters"}
+    assert report["frame"] == "body"
     assert report["points"] == len(read_cloud(tmp_path / "cloud.ply"))
     left, right, *others = sorted(report["clusters"], key=lambda each: -each["points"])
     assert set(left) == {"points", "range_m", "centre_m", "size_m", "axes", "low_m", "high_m"}
@@ -126,14 +129,15 @@ def test_clusters_are_the_walls_and_the_pole(frame: Frame, tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("pitch_deg", ["35", "50"])
-def test_ground_that_is_not_level_is_warned_about(frame: Frame, tmp_path: Path, pitch_deg: str) -> None:
+def test_ground_that_is_not_level_is_warned_about(
+    frame: Frame, tmp_path: Path, pitch_deg: str, caplog: pytest.LogCaptureFixture
+) -> None:
     """As of a camera whose tilt is not set."""
     with shared(frame):
         result = run(URI, tmp_path / "cloud.ply", "--clusters", "--attitude", "0", pitch_deg, "0")
     assert result.exit_code == 0, result.output
-    (line,) = result.stderr.splitlines()
-    assert line.startswith("companion: ")
-    assert "--attitude" in line
+    (record,) = caplog.records
+    assert "--attitude" in record.getMessage()
 
 
 def test_depth_of_a_second_source_is_used(frame: Frame, tmp_path: Path) -> None:
@@ -141,8 +145,10 @@ def test_depth_of_a_second_source_is_used(frame: Frame, tmp_path: Path) -> None:
     for name, array in (("image", frame.image), ("depth", depth_mm)):
         (tmp_path / name).mkdir()
         cv2.imwrite(str(tmp_path / name / "000.png"), array)
-    folders = (tmp_path / "image", tmp_path / "a.ply", "--source-depth", tmp_path / "depth")
-    result = run(*folders, "--camera-mount-pitch-deg", "-90", "--max-range", "5")
+    depth = ("--source-depth", tmp_path / "depth")
+    result = run(
+        tmp_path / "image", tmp_path / "a.ply", *depth, "--camera-mount-pitch-deg", "-90", "--max-range", "5"
+    )
     assert result.exit_code == 0, result.output
     cloud = read_cloud(tmp_path / "a.ply")
     assert len(cloud) == frame.height * frame.width
@@ -171,14 +177,14 @@ def test_other_bad_input_is_one_line(frame: Frame, tmp_path: Path) -> None:
     output = tmp_path / "a.ply"
     with shared(frame):
         assert "a.las" in refused(URI, tmp_path / "a.las")
-        assert "a.gif" in refused(URI, output, "--view", tmp_path / "a.gif")
+        assert "a.gif" in refused(URI, output, "--cloud-view", tmp_path / "a.gif")
         assert "--attitude" in refused(URI, output, "--attitude", "0", "nan", "0")
         missing = tmp_path / "missing" / "a.ply"
         line = refused(URI, missing)
         assert f"write {missing}: " in line
         assert "such folder" in line
-        assert "missing" in refused(URI, output, "--view", tmp_path / "missing" / "a.png")
+        assert "missing" in refused(URI, output, "--cloud-view", tmp_path / "missing" / "a.png")
         assert "camera.horizontal_fov_deg" in refused(URI, output, "--camera-horizontal-fov-deg", "-1")
     with shared(frame, replace(DEFAULT_MOUNT, on_gimbal=True)):
-        assert "gimbal" in refused(URI, output, "--frame", "body")
-        assert run(URI, output, "--frame", "camera").exit_code == 0
+        assert "gimbal" in refused(URI, output, "--cloud-frame", "body")
+        assert run(URI, output, "--cloud-frame", "camera").exit_code == 0

@@ -1,4 +1,4 @@
-"""`companion config --check`: what is wrong, what may come later, and silence."""
+"""`companion describe settings --check`: what is wrong, what may come later, and silence."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FILES = [flag.key for flag in flags() if flag.key.endswith("_file")]
 def check(folder: Path, *arguments: str | Path, source: str | None = "none") -> tuple[int, list[str]]:
     """Return the exit code and the lines on standard error; nothing else is printed."""
     given = [] if source is None else ["--source", source]
-    done = companion_here("config", "--check", *given, *arguments, cwd=folder)
+    done = companion_here("describe", "settings", "--check", *given, *arguments, cwd=folder)
     assert done.stdout == ""
     assert all(line.startswith("companion: ") for line in done.stderr.splitlines())
     return done.returncode, [line.removeprefix("companion: ") for line in done.stderr.splitlines()]

@@ -57,8 +57,8 @@ CASES = [
     ("play --detector-model nothing.pt {free}", WRONG, "nothing.pt"),
     ("demo --vehicle-url udpin://127.0.0.1:{udp}", EXIT_PASSING, "{udp}"),
     ("demo --vehicle-url serial:///dev/ttyACM0:57600", WRONG, "udpin"),
-    ("dashboard --listen 127.0.0.1:{tcp}", EXIT_PASSING, "{tcp}"),
-    ("dashboard --listen nonsense", WRONG, "HOST:PORT"),
+    ("view --dashboard-listen 127.0.0.1:{tcp}", EXIT_PASSING, "{tcp}"),
+    ("view --dashboard-listen nonsense", WRONG, "HOST:PORT"),
     ("run --source - --detector-kind none-such {free}", WRONG, "none-such"),
 ]
 

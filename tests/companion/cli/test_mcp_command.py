@@ -74,11 +74,9 @@ async def test_http_serves_programs_with_the_token(
 
     listen = f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     url = f"http://{listen}/mcp"
-    settings = plain_settings({"vehicle.name": "vehicle"})
     async with service() as there:
-        serving = asyncio.create_task(
-            _serve(settings, ["takeoff"], listen, _access(listen, token_file), there.endpoint)
-        )
+        settings = plain_settings({"vehicle.name": "vehicle", "zenoh.connect": there.endpoint})
+        serving = asyncio.create_task(_serve(settings, ["takeoff"], listen, _access(listen, token_file)))
         await shown(url, capsys)
         bearer = {"authorization": f"Bearer {TOKEN}"}
         async with httpx2.AsyncClient() as http:

@@ -56,7 +56,7 @@ from vision.camera_model import CameraModel
 
 pytestmark = pytest.mark.realtime
 
-_MARKER = ("--dictionary", MARKER_DICTIONARY, "--size", "0.1")
+_MARKER = f"--markers {MARKER_DICTIONARY} --markers-size-m 0.1"
 _LIMIT = 2
 
 
@@ -105,13 +105,16 @@ def is_image(image: NDArray[Any] | None, size: tuple[int, int] = (WIDTH, HEIGHT)
 
 
 def saved_images(folder: Path, count: set[int], size: tuple[int, int] = (WIDTH, HEIGHT)) -> None:
+    """Check the annotated images; the input is beside them."""
+    assert len([path for path in folder.iterdir() if path.is_file()]) in count
+    folder = folder / "detections"
     files = sorted(path for path in folder.iterdir() if path.is_file())
     assert len(files) in count
     for path in files:
         is_image(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), size)
 
 
-def preview_saves(size: tuple[int, int]) -> Callable[[Done], None]:
+def status_saves(size: tuple[int, int]) -> Callable[[Done], None]:
     def check(done: Done) -> None:
         assert len(done.lines()) in done.frames()
         saved_images(done.folder / "out", done.frames(), size)
@@ -119,12 +122,12 @@ def preview_saves(size: tuple[int, int]) -> Callable[[Done], None]:
     return check
 
 
-def turned_preview(done: Done) -> None:
-    assert all(line.startswith("front (") and f"{HEIGHT}x{WIDTH}" in line for line in done.lines())
+def turned_status(done: Done) -> None:
+    assert all("  front (" in line and f"{HEIGHT}x{WIDTH}" in line for line in done.lines())
     saved_images(done.folder / "out", done.frames(_LIMIT), (HEIGHT, WIDTH))
 
 
-def repeated_preview(done: Done) -> None:
+def repeated_status(done: Done) -> None:
     numbers = [int(cast(re.Match[str], re.search(r"frame (\d+),", line))[1]) for line in done.lines()]
     assert numbers == sorted(set(numbers))
     assert len(numbers) in ({FRAMES + 1} if done.given.frames else range(1, FRAMES + 2))
@@ -137,8 +140,8 @@ def depth_saves(done: Done) -> None:
 def depth_messages(done: Done) -> None:
     messages = [json.loads(line) for line in done.lines()]
     assert len(messages) in done.frames(_LIMIT)
-    assert [message["centre_m"] for message in messages] == [OTHER_DEPTH_M] * len(messages)
-    assert all(message["valid_share"] == 1.0 for message in messages)
+    assert [message["depth"]["centre_m"] for message in messages] == [OTHER_DEPTH_M] * len(messages)
+    assert all(message["depth"]["valid_share"] == 1.0 for message in messages)
 
 
 def detected(done: Done) -> None:
@@ -146,7 +149,6 @@ def detected(done: Done) -> None:
     assert len(messages) in done.frames(_LIMIT)
     assert {(message["width"], message["height"]) for message in messages} == {(WIDTH, HEIGHT)}
     saved_images(done.folder / "out", {len(messages)})
-    assert len(list((done.folder / "out" / "detections").iterdir())) == len(messages)
 
 
 def detected_every_second(done: Done) -> None:
@@ -162,7 +164,7 @@ def cloud_written(done: Done) -> None:
 
 
 def cloud_as_text(done: Done) -> None:
-    report = json.loads(done.result.stdout)
+    report = json.loads(done.result.stdout)["cloud"]
     assert report["frame"] == "ned"
     assert report["points"] > 100
     assert isinstance(report["clusters"], list)
@@ -185,56 +187,59 @@ def mounted(done: Done) -> None:
     ]
 
 
-_ALL = "--period 0 --source-every-frame true"
+_STATUS = "--model none --period 0"
+_ALL = f"{_STATUS} --source-every-frame true"
+_MODEL = "--model {model} --image-size 160"
 ROWS = (
-    Row("preview", f"{_ALL} --save {{}}/out", preview_saves((WIDTH, HEIGHT)), ends=False),
-    Row("preview", f"{_ALL} --save {{}}/out --grey", preview_saves((WIDTH // 3, HEIGHT // 3)), ends=False),
-    Row("preview", f"{_ALL} --save {{}}/out --level", preview_saves((WIDTH, HEIGHT)), ends=False),
+    Row("detect", f"{_ALL} --save {{}}/out", status_saves((WIDTH, HEIGHT)), ends=False),
+    Row("detect", f"{_ALL} --save {{}}/out --grey", status_saves((WIDTH // 3, HEIGHT // 3)), ends=False),
+    Row("detect", f"{_ALL} --save {{}}/out --level", status_saves((WIDTH, HEIGHT)), ends=False),
     Row(
-        "preview",
+        "detect",
         f"{_ALL} --save {{}}/out --grey --level",
-        preview_saves((WIDTH // 3, HEIGHT // 3)),
+        status_saves((WIDTH // 3, HEIGHT // 3)),
         ends=False,
     ),
     Row(
-        "preview",
+        "detect",
         f"{_ALL} --save {{}}/out --limit {_LIMIT} --source-rotate-deg 270 --source-mirror true "
         "--source-name front",
-        turned_preview,
+        turned_status,
     ),
     Row(
-        "preview",
-        f"--period 0 --source-loop true --source-rate-hz 50 --limit {FRAMES + 1}",
-        repeated_preview,
+        "detect",
+        f"{_STATUS} --source-loop true --source-rate-hz 50 --limit {FRAMES + 1}",
+        repeated_status,
         refused=("depth",),
     ),
-    Row("depth", f"--save {{}}/out --limit {_LIMIT}", depth_saves, needs_depth=True),
+    Row("detect", f"--model none --depth --save {{}}/out --limit {_LIMIT}", depth_saves, needs_depth=True),
     Row(
-        "depth",
-        f"--json --limit {_LIMIT} --detect --detector-model {{model}} --detector-image-size 160",
+        "detect",
+        f"--depth --attitude 0 0 0 --json --limit {_LIMIT} {_MODEL}",
         depth_messages,
         needs_depth=True,
     ),
     Row(
         "detect",
-        f"--model {{model}} --image-size 160 --save {{}}/out --json --track --tiles --tile-size 200 "
-        f"--tile-overlap 0.1 --limit {_LIMIT}",
+        f"{_MODEL} --save {{}}/out --json --track --tiles --tile-size 200 --tile-overlap 0.1 "
+        f"--limit {_LIMIT}",
         detected,
+    ),
+    Row("detect", f"{_MODEL} --save {{}}/out --every 2 --limit {FRAMES // 2}", detected_every_second),
+    Row(
+        "detect",
+        "--model none --cloud {}/cloud.ply --cloud-view {}/view.png --cloud-frame camera",
+        cloud_written,
+        needs_depth=True,
     ),
     Row(
         "detect",
-        f"--model {{model}} --image-size 160 --save {{}}/out --every 2 --limit {FRAMES // 2}",
-        detected_every_second,
-    ),
-    Row("cloud", "{}/cloud.ply --view {}/view.png --frame camera", cloud_written, needs_depth=True),
-    Row(
-        "cloud",
-        "{}/cloud.pcd --view {}/view.jpg --frame ned --clusters --text --json --max-range 10 --voxel 0.1 "
-        "--average 4 --attitude 0 0 0",
+        "--model none --cloud {}/cloud.pcd --cloud-view {}/view.jpg --cloud-frame ned --clusters "
+        "--cloud-text --json --max-range 10 --voxel 0.1 --average 4 --attitude 0 0 0",
         cloud_as_text,
         needs_depth=True,
     ),
-    Row("markers detect", f"--save {{}}/out --json --limit {_LIMIT} {' '.join(_MARKER)}", markers_found),
+    Row("detect", f"--model none --save {{}}/out --json --limit {_LIMIT} {_MARKER}", markers_found),
     Row(
         "calibrate mount",
         f"--marker {MARKER_ID} --size 0.1 --frames 1 --calibration {{}}/camera.yaml",
@@ -243,20 +248,17 @@ ROWS = (
 )
 
 # Options of the same commands that neither show nor record, or that say what the source is.
-OF_THE_DETECTOR = {
-    "--detector-kind", "--model", "--classes", "--confidence", "--iou", "--image-size", "--runtime",
-    "--precision", "--device", "--threads", "--retune", "--pull",
-}  # fmt: skip
-OF_THE_SOURCE = {"--width", "--height", "--rate", "--pixel-format", "--plugins-modules"}
+OF_THE_DETECTOR = {"--retune", "--pull"}
+OF_THE_SOURCE = {"--width", "--height"}
 OF_THE_TASK = {
-    "--dictionary", "--size", "--print", "--marker", "--heading", "--roll", "--pitch", "--live", "--connect",
-    "--board", "--square", "--name", "--output", "--colour-calibration", "--infrared-calibration",
-    "--calibration",
+    "--dictionary", "--size", "--print", "--marker", "--heading", "--roll", "--pitch", "--live", "--board",
+    "--square", "--name", "--output", "--calibration", "--depth-source", "--depth-calibration",
 }  # fmt: skip
+# Settings that are flags with short names.
+OF_SETTINGS = {"--model", "--image-size", "--markers-size-m"}
 # They need images of a board: tests/companion/camera_tools/test_calibrate_command.py.
 WITH_A_BOARD = {
     "calibrate lens --report", "calibrate lens --every", "calibrate lens --rotate", "calibrate lens --mirror",
-    "calibrate extrinsics --every", "calibrate extrinsics --rotate", "calibrate extrinsics --mirror",
     "calibrate mount --rotate", "calibrate mount --mirror",
 }  # fmt: skip
 # Of the service's worker, below; and of its recorder, which gets messages, whatever the source is.
@@ -282,7 +284,7 @@ def _options(command: Any, name: str = "") -> Iterator[str]:
     if hasattr(command, "commands"):
         for word, each in command.commands.items():
             yield from _options(each, f"{name} {word}".strip())
-    elif not name.startswith("models") and {each.name for each in command.params} & {"source", "colour"}:
+    elif not name.startswith("models") and "source" in {each.name for each in command.params}:
         for each in command.params:
             if each.param_type_name == "option" and each.name not in ("config_file", "help"):
                 yield f"{name} {max(each.opts, key=len)}"
@@ -293,23 +295,21 @@ def _rows() -> set[str]:
 
 
 def test_every_option_of_a_source_has_a_row() -> None:
-    elsewhere = OF_THE_DETECTOR | OF_THE_SOURCE | OF_THE_TASK
+    elsewhere = OF_THE_DETECTOR | OF_THE_SOURCE | OF_THE_TASK | OF_SETTINGS
     found = {text for text in _options(typer.main.get_command(app)) if text.split()[-1] not in elsewhere}
     tried = {text for text in _rows() if "--source-" not in text and text.split()[-1] not in elsewhere}
-    assert found == {text for text in tried if "--detector-" not in text} | WITH_A_BOARD
+    assert found == tried | WITH_A_BOARD
 
 
 def test_every_setting_of_viewing_and_recording_has_a_row() -> None:
     found = {flag.key for flag in flags() if flag.key.partition(".")[0] in ("source", "recording", "preview")}
     of_preview = {f"--{key.replace('.', '-').replace('_', '-')}": key for key in found}
-    tried = {key for flag, key in of_preview.items() if f"preview {flag}" in _rows()}
+    tried = {key for flag, key in of_preview.items() if f"detect {flag}" in _rows()}
     assert found == tried | {"source.share"} | SOURCE_ITSELF | OF_THE_WORKER.keys() | OF_THE_RECORDER
 
 
-@pytest.mark.parametrize("command", ["preview", "depth", "cloud"])
-def test_only_the_service_takes_the_option_to_share(command: str, tmp_path: Path) -> None:
-    arguments = ["cloud.ply"] if command == "cloud" else []
-    done = companion_here(command, "a.png", *arguments, "--source-share", "front", cwd=tmp_path)
+def test_only_the_service_takes_the_option_to_share(tmp_path: Path) -> None:
+    done = companion_here("detect", "a.png", "--source-share", "front", cwd=tmp_path)
     assert done.returncode == 2
     assert "--source-share" in done.stderr
 
@@ -345,7 +345,7 @@ def test_an_option_works_with_a_kind_of_source(
 ) -> None:
     kind = request.node.callspec.params["given"]
     monkeypatch.setattr(
-        "companion.camera_tools.preview.attitudes_of",
+        "companion.camera_tools.attitudes.attitudes_of",
         lambda _settings: contextlib.nullcontext(level_vehicle()),
     )
     lens = CameraModel(WIDTH, HEIGHT, 300.0, 300.0, WIDTH / 2, HEIGHT / 2)
@@ -353,13 +353,13 @@ def test_an_option_works_with_a_kind_of_source(
     options = row.options.replace("{model}", str(exported_model)).replace("{}", str(tmp_path)).split()
     if given.frames is None and not row.ends:
         options += ["--limit", str(_LIMIT)]
-    if row.command in ("preview", "depth", "cloud"):
+    if row.command == "detect":
         options += given.flags
     with written_to_standard_input(given.standard_input):
         result = companion_here(*row.command.split(), given.uri, *options, cwd=tmp_path)
     if kind in row.refused or (row.needs_depth and not given.depth):
         assert result.returncode == 2
-        (line,) = result.stderr.splitlines()
+        (line,) = [line for line in result.stderr.splitlines() if "rendered scenes" not in line]
         assert line.startswith("companion: ")
         assert result.stdout == ""
         return

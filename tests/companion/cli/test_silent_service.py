@@ -11,7 +11,7 @@ import pytest
 
 from companion.bus import topics
 from companion.bus.session import Bus
-from companion.cli import client, mission
+from companion.cli import client
 from companion.cli.flags import say_silent
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.realtime
 SILENT_S = 0.2
 
 
-@pytest.mark.parametrize("words", [("send", "orbit"), ("mission", "demo")])
+@pytest.mark.parametrize("words", [("send", "orbit"), ("send", "--file", "demo")])
 async def test_command_says_once_that_the_service_is_silent(
     words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -36,8 +36,7 @@ async def test_command_says_once_that_the_service_is_silent(
         loop.call_soon_threadsafe(silence_is_said.set)
         say_silent(text)
 
-    for module in (client, mission):
-        monkeypatch.setattr(module, "say_silent", say)
+    monkeypatch.setattr(client, "say_silent", say)
 
     async def answer_late(_text: str) -> dict[str, Any]:
         await silence_is_said.wait()

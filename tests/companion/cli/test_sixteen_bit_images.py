@@ -16,11 +16,11 @@ from vision.calibration.boards import Board
 LENS, BOARD = LENSES["webcam"].scaled(320, 240), Board("chessboard", 7, 5, 0.03)
 COMMANDS = {
     "detect": "detect images --model {model} --image-size 64 --save saved",
-    "preview": "preview images --period 0 --save saved",
-    "evaluate": "evaluate images --model {model} --image-size 64",
-    "train": "train --data images --validation images --from {model} --output out.safetensors "
+    "status": "detect images --model none --period 0 --save saved",
+    "evaluate": "learn evaluate images --model {model} --image-size 64",
+    "train": "learn train --data images --validation images --from {model} --output out.safetensors "
     "--image-size 64 --batch-size 2 --workers 0 --steps 1",
-    "verify": "models verify {model} {exported} --images images",
+    "compare": "models show {model} --compare {exported} --images images",
     "calibrate": "calibrate lens images --board chessboard 7x5 --square 0.03 -o lens.yaml",
 }
 
@@ -51,7 +51,7 @@ def test_counts_of_14_bits_are_stretched_and_said_once(
     said = re.findall(r"16-bit image with values (\d+) to (\d+)", done.stderr)
     assert len(said) == 1
     assert 7000 <= int(said[0][0]) < int(said[0][1]) <= 7000 + 255 * 8
-    for path in (tmp_path / "saved").glob("*.*"):
+    for path in (tmp_path / "saved").glob("**/*.*"):
         saved = cv2.imread(str(path))
         assert saved is not None
         assert np.ptp(saved) > 200

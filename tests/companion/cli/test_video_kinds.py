@@ -85,8 +85,8 @@ def test_video_without_frames_is_one_line(
     arguments, changed, word = REFUSED[name]
     path = written(tmp_path / name, *arguments)
     path.write_bytes(changed(path.read_bytes()))
-    for command in ("detect", "preview"):
-        done = companion_here(command, name, cwd=tmp_path)
+    for model in ("default", "none"):
+        done = companion_here("detect", name, "--model", model, cwd=tmp_path)
         assert done.returncode == 2
         (line,) = done.stderr.splitlines()
         assert name in line

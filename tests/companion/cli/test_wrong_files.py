@@ -30,74 +30,74 @@ from vision.camera_model import CameraModel
 # Parameter → its readers: the arguments, with {} for the file, and the suffix that selects the reader.
 _DETECT = "detect {} --model small.onnx --limit 1"
 _LENS = "calibrate lens {} --board chessboard 7x5 --square 0.03"
-_EXTRINSICS = (
-    "calibrate extrinsics {colour} {infrared} --board chessboard 7x5 --square 0.03 --colour-calibration "
-    "{colour_calibration} --infrared-calibration {infrared_calibration}"
+_DEPTH_CAMERA = (
+    "calibrate lens {source} --depth-source {depth_source} --board chessboard 7x5 --square 0.03 "
+    "--calibration {calibration} --depth-calibration {depth_calibration}"
 )
 _MODELS = (".pt", ".pth", ".safetensors", ".onnx", ".xml", ".engine", ".torchscript", ".tflite")
 _SOURCES = (".mp4", ".jpg", ".npy")
 
 
-def _extrinsics(name: str) -> str:
-    others = {"colour": "frame.png", "infrared": "frame.png"}
-    others |= {"colour_calibration": "camera.yaml", "infrared_calibration": "camera.yaml"}
-    return _EXTRINSICS.format(**{**others, name: "{}"})
+def _depth_camera(name: str) -> str:
+    others = {"source": "frame.png", "depth_source": "frame.png"}
+    others |= {"calibration": "camera.yaml", "depth_calibration": "camera.yaml"}
+    return _DEPTH_CAMERA.format(**{**others, name: "{}"})
 
 
 READERS: dict[str, tuple[tuple[str, str], ...]] = {
-    "detect source": tuple((_DETECT, suffix) for suffix in _SOURCES),
-    "detect model": (("detect frame.png --model {}", ".onnx"), ("detect frame.png --model {}", ".pt")),
+    "detect source": (
+        *((_DETECT, suffix) for suffix in _SOURCES),
+        ("detect {} --model none", ".mp4"),
+        ("detect {} --model none --depth", ".mp4"),
+        ("detect {} --model none --cloud out.ply", ".mp4"),
+        ("detect {} --model none --markers 4X4_50", ".mp4"),
+    ),
+    "detector.model": (("detect frame.png --model {}", ".onnx"), ("detect frame.png --model {}", ".pt")),
     "mcp token_file": (("mcp --listen 127.0.0.1:0 --token-file {}", ".txt"),),
-    "preview source": (("preview {} --limit 1", ".mp4"),),
-    "depth source": (("depth {} --limit 1", ".mp4"),),
-    "mission file": (("mission {} --check", ".toml"),),
-    "cloud source": (("cloud {} out.ply", ".mp4"),),
-    "replay files": (("replay {}", ".mcap"),),
-    "sightings files": (("sightings --kml {}", ".mcap"),),
-    "collect files": (("collect folder {}", ".mcap"),),
-    "evaluate dataset": (("evaluate {}", ".yaml"), ("evaluate {}", ".json")),
-    "evaluate model": (("evaluate labelled --model {}", ".pt"),),
-    "evaluate images": (("evaluate annotations.json --images {}", ".zip"),),
-    "train start": (("train --data labelled --steps 1 --from {}", ".pt"),),
-    "train data": (("train --data {} --steps 1", ".yaml"),),
-    "train validation": (("train --data labelled --steps 1 --validation {}", ".yaml"),),
-    "models info file": tuple(("models info {}", suffix) for suffix in _MODELS),
+    "send file": (("send --file {} --check", ".toml"),),
+    "log replay files": (("log replay {}", ".mcap"),),
+    "learn collect files": (("learn collect folder {}", ".mcap"),),
+    "learn evaluate dataset": (("learn evaluate {}", ".yaml"), ("learn evaluate {}", ".json")),
+    "learn evaluate model": (("learn evaluate labelled --model {}", ".pt"),),
+    "learn evaluate images": (("learn evaluate annotations.json --images {}", ".zip"),),
+    "learn train start": (("learn train --data labelled --steps 1 --from {}", ".pt"),),
+    "learn train data": (("learn train --data {} --steps 1", ".yaml"),),
+    "learn train validation": (("learn train --data labelled --steps 1 --validation {}", ".yaml"),),
+    "models show file": (
+        *(("models show {}", suffix) for suffix in _MODELS),
+        ("models show {} --compare frame.png", ".pt"),
+    ),
     "models export file": (("models export {} --to onnx", ".pt"),),
     "models export calibrate": (
         ("models export small.pt --to onnx --output out.onnx --precision int8 --calibrate {}", ".zip"),
     ),
-    "models verify source": (("models verify {} frame.png", ".pt"),),
-    "models verify exported": (("models verify small.pt {}", ".onnx"),),
-    "models verify images": (("models verify small.pt small.onnx --images {}", ".zip"),),
-    "calibrate lens source": ((_LENS, ".mp4"),),
-    "calibrate extrinsics colour": ((_extrinsics("colour"), ".mp4"),),
-    "calibrate extrinsics infrared": ((_extrinsics("infrared"), ".mp4"),),
-    "calibrate extrinsics colour_calibration": ((_extrinsics("colour_calibration"), ".yaml"),),
-    "calibrate extrinsics infrared_calibration": ((_extrinsics("infrared_calibration"), ".yaml"),),
+    "models show compare": (("models show small.pt --compare {}", ".onnx"),),
+    "models show images": (("models show small.pt --compare small.onnx --images {}", ".zip"),),
+    "calibrate lens source": ((_LENS, ".mp4"), (_depth_camera("source"), ".mp4")),
+    "calibrate lens depth_source": ((_depth_camera("depth_source"), ".mp4"),),
+    "calibrate lens calibration": ((_depth_camera("calibration"), ".yaml"),),
+    "calibrate lens depth_calibration": ((_depth_camera("depth_calibration"), ".yaml"),),
     "calibrate mount source": (("calibrate mount {} --marker 0 --size 0.1", ".mp4"),),
     "calibrate mount calibration": (
         ("calibrate mount frame.png --marker 0 --size 0.1 --calibration {}", ".yaml"),
     ),
-    "markers detect source": (("markers detect {} --dictionary 4X4_50 --size 0.1", ".mp4"),),
     "bench detector model": (("bench detector --model {} --frames 5", ".onnx"),),
     "bench detector against": (("bench detector --against {}", ".json"),),
-    "log list directory": (("log list {}", ".mcap"),),
-    "log show file": (("log show {}", ".mcap"),),
-    "log recover file": (("log recover {} out.mcap", ".mcap"),),
-    "log tlog file": (("log tlog {} out.tlog", ".mcap"),),
-    "config": (("config --config {}", ".toml"),),
-    "vehicle.signing_key_file": (("config --check --vehicle-signing-key-file {}", ".key"),),
-    "source.depth": (("depth frame.png --source-depth {} --limit 1", ".npy"),),
+    "log show paths": (("log show {}", ".mcap"), ("log show --objects kml {}", ".mcap")),
+    "log convert file": (("log convert {} out.mcap", ".mcap"), ("log convert {} out.tlog", ".mcap")),
+    "config": (("describe settings --config {}", ".toml"),),
+    "vehicle.signing_key_file": (("describe settings --check --vehicle-signing-key-file {}", ".key"),),
+    "source.depth": (("detect frame.png --model none --depth --source-depth {}", ".npy"),),
     "source.depth_calibration_file": (
-        ("config --source-depth frame.png --source-depth-calibration-file {}", ".yaml"),
+        ("describe settings --source-depth frame.png --source-depth-calibration-file {}", ".yaml"),
     ),
-    "camera.calibration_file": (("config --camera-calibration-file {}", ".yaml"),),
-    "markers.boards_file": (("config --markers-boards-file {}", ".toml"),),
-    "markers.map_file": (("config --markers-map-file {}", ".toml"),),
-    "zenoh.config_file": (("config --check --zenoh-config-file {}", ".json5"),),
-    "zenoh.child_config_file": (("config --check --zenoh-child-config-file {}", ".json5"),),
-    "dashboard.token_file": (("config --check --dashboard-token-file {}", ".txt"),),
-    "language.key_file": (("config --check --language-key-file {}", ".txt"),),
+    "camera.calibration_file": (("describe settings --camera-calibration-file {}", ".yaml"),),
+    "markers.boards_file": (("describe settings --markers-boards-file {}", ".toml"),),
+    "markers.map_file": (("describe settings --markers-map-file {}", ".toml"),),
+    "zenoh.config_file": (("describe settings --check --zenoh-config-file {}", ".json5"),),
+    "zenoh.child_config_file": (("describe settings --check --zenoh-child-config-file {}", ".json5"),),
+    "dashboard.token_file": (("describe settings --check --dashboard-token-file {}", ".txt"),),
+    "language.key_file": (("describe settings --check --language-key-file {}", ".txt"),),
 }
 _PLAN = {"fileType": "Plan", "groundStation": "QGroundControl", "mission": {"items": []}, "version": 1}
 
@@ -156,25 +156,23 @@ KINDS = (*CONTENTS, "zip", "folder", "missing", "unreadable", "device", "fifo")
 
 # Other parameters that are text or paths: written, not read; or no files.
 WRITTEN = {
-    "demo output", "detect save", "preview save", "depth save", "topics schema", "cloud output", "cloud view",
-    "record directory", "collect folder", "evaluate misses", "train output", "train-policy output",
-    "models list folder", "models pull folder", "models export output", "calibrate lens output",
-    "calibrate lens report", "calibrate extrinsics output", "markers detect save", "markers print output",
-    "log recover output", "log tlog output", "recording.video", "recording.directory",
+    "demo output", "detect save", "detect cloud", "detect cloud_view", "describe schema", "markers output",
+    "log record directory", "log convert output", "learn collect folder", "learn evaluate misses",
+    "learn train output", "models show folder", "models pull folder", "models export output",
+    "calibrate lens output", "calibrate lens report", "recording.video", "recording.directory",
 }  # fmt: skip
 # Read by what other rows run: the service opens them as `detect` does.
-ELSEWHERE = {"view source", "play scene", "replay model", "source.uri", "detector.model"}
+ELSEWHERE = {"view source", "play scene", "log replay model", "source.uri"}
 NO_FILES = {
-    "connect", "seeds", "ray", "vehicle_url", "detector_kind", "classes", "runtime", "precision", "device",
-    "pixel_format", "plugins_modules", "command", "key", "sentence", "allow", "listen", "changes", "camera",
-    "split", "environment", "algorithm", "name", "url", "to", "board", "dictionary", "printed",
-    "identifiers", "paper", "frame",
+    "seeds", "ray", "vehicle_url", "classes", "runtime", "precision", "device", "command", "key", "sentence",
+    "allow", "listen", "changes", "camera", "split", "policy", "algorithm", "name", "url", "to", "board",
+    "dictionary", "printed", "identifiers", "paper", "frame", "markers",
 }  # fmt: skip
 # What these readers take: an image by its content; any text as a passphrase or key; an empty settings file.
 _IMAGES = {
     name: {"jpeg"}
     for name, rows in READERS.items()
-    if name.endswith((" source", " colour", " infrared")) and not name.startswith("models")
+    if name.endswith((" source", " depth_source")) and not name.startswith("models")
 }
 # To a pipe somebody may write later.
 ACCEPTED: dict[str, set[str]] = {name: kinds | {"fifo"} for name, kinds in _IMAGES.items()} | {
@@ -182,7 +180,7 @@ ACCEPTED: dict[str, set[str]] = {name: kinds | {"fifo"} for name, kinds in _IMAG
     "config": {"empty", "device"},
     "vehicle.signing_key_file": {"toml", "json"},
     "language.key_file": {"toml", "json", "line"},
-    "log list directory": {"folder"},
+    "log show paths": {"folder"},
 }
 _FOREIGN = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|Traceback|[Pp]rotobuf|\.cpp|site-packages|Errno")
 
@@ -290,7 +288,8 @@ def test_programs_name_a_wrong_scene(command: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["models info {}", "detect frame.png --model {}", "train --data labelled --steps 1 --from {}"]
+    "command",
+    ["models show {}", "detect frame.png --model {}", "learn train --data labelled --steps 1 --from {}"],
 )
 def test_a_checkpoint_of_classification_says_what_it_is(
     command: str, right: Path, monkeypatch: pytest.MonkeyPatch

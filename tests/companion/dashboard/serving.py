@@ -81,8 +81,14 @@ def dashboard_here(endpoint: str) -> Iterator[str]:
 
 @contextmanager
 def dashboard_command(endpoint: str, cwd: Path | None = None) -> Iterator[str]:
-    """Run `companion dashboard`; yields the page's address. It is ended by Ctrl-C, with exit code 0."""
-    command = ["dashboard", "--connect", endpoint, "--listen", f"127.0.0.1:{free_port(socket.SOCK_STREAM)}"]
+    """Run `companion view`; yields the page's address. It is ended by Ctrl-C, with exit code 0."""
+    command = [
+        "view",
+        "--connect",
+        endpoint,
+        "--dashboard-listen",
+        f"127.0.0.1:{free_port(socket.SOCK_STREAM)}",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "companion.cli", *command],
         cwd=cwd,

@@ -48,19 +48,19 @@ def test_command_serves_and_ends_on_ctrl_c(tmp_path: Path) -> None:
         with urllib.request.urlopen(url, timeout=10) as response:
             assert response.status == 200
         address = url.removeprefix("http://").strip("/")
-        busy = companion("dashboard", "--connect", "tcp/127.0.0.1:9", "--listen", address, cwd=tmp_path)
+        busy = companion("view", "--connect", "tcp/127.0.0.1:9", "--dashboard-listen", address, cwd=tmp_path)
         assert busy.returncode == EXIT_PASSING
         (line,) = busy.stderr.splitlines()
         assert address in line
-        assert " --listen " in line
+        assert " --dashboard-listen " in line
 
 
 @pytest.mark.parametrize(
     ("flags", "named"),
     [
-        (("--listen", "0.0.0.0:8088"), "dashboard.token_file"),
-        (("--listen", "127.0.0.1:99999"), "99999"),
-        (("--listen", "nonsense"), "HOST:PORT"),
+        (("--dashboard-listen", "0.0.0.0:8088"), "dashboard.token_file"),
+        (("--dashboard-listen", "127.0.0.1:99999"), "99999"),
+        (("--dashboard-listen", "nonsense"), "HOST:PORT"),
         (("--dashboard-listen", ""), "dashboard.listen"),
         (("--dashboard-listen", "8088"), "dashboard.listen"),
         (("--dashboard-token-file", "missing.txt"), "dashboard.token_file"),
@@ -71,7 +71,7 @@ def test_bad_options_are_refused_in_one_line(
     tmp_path: Path, flags: tuple[str, ...], named: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("os.nice", lambda _: 0)  # this process keeps its priority
-    done = companion_here("dashboard", "--connect", "tcp/127.0.0.1:9", *flags, cwd=tmp_path)
+    done = companion_here("view", "--connect", "tcp/127.0.0.1:9", *flags, cwd=tmp_path)
     assert done.returncode == 2, done.stdout
     (line,) = done.stderr.splitlines()
     assert named in line

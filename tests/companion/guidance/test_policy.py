@@ -315,7 +315,7 @@ def test_policy_must_observe_what_it_flies_to(tmp_path: Path) -> None:
 
 
 def test_file_that_is_no_policy_is_refused_in_one_line(write: Write, tmp_path: Path) -> None:
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*no description .*companion train-policy"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*no description .*companion learn train"):
         built(write(key="other"))
     path = write()
     whole = path.read_bytes()

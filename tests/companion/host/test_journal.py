@@ -87,7 +87,7 @@ def test_no_priorities_where_it_is_not_the_journal(tmp_path: Path) -> None:
         (["run", "--source", "absent.mp4"], "<3>", 2),
         (["run", "--nonsense"], "<3>", 2),
         (["run", "--config", "absent.toml"], "<3>", 2),
-        (["config", "--check", "--source", "/dev/video77"], "<4>", 0),
+        (["describe", "settings", "--check", "--source", "/dev/video77"], "<4>", 0),
     ],
 )
 def test_lines_of_commands_have_priorities(

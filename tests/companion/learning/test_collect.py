@@ -176,7 +176,7 @@ def recorded(folder: Path, **changes: str) -> Path:
 
 def test_command_collects_from_a_recording(tmp_path: Path) -> None:
     path = recorded(tmp_path / "recordings")
-    result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
+    result = CliRunner().invoke(app, ["learn", "collect", str(tmp_path / "set"), str(path)])
     assert result.exit_code == 0, result.stderr
     assert [line.partition(": ")[2] for line in result.stdout.splitlines()] == [
         "doubted dog 2",
@@ -194,7 +194,7 @@ def test_unusable_input_is_one_line(tmp_path: Path, case: str) -> None:
     if case in tables:
         (tmp_path / "set").mkdir()
         (tmp_path / "set" / "data.yaml").write_text(tables[case])
-    result = CliRunner().invoke(app, ["collect", str(tmp_path / "set"), str(path)])
+    result = CliRunner().invoke(app, ["learn", "collect", str(tmp_path / "set"), str(path)])
     assert result.exit_code == 2
     assert len([line for line in result.stderr.splitlines() if line.startswith("companion:")]) == 1
 

@@ -1,4 +1,4 @@
-"""`companion evaluate` on small data sets and on real photographs."""
+"""`companion learn evaluate` on small data sets and on real photographs."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_command_writes_json_and_image(tmp_path: Path, small_model: Path) -> Non
     data = dataset(tmp_path, None)
     for sample, line in zip(data.samples, ("0 0.5 0.5 0.5 0.5\n", ""), strict=True):
         sample.image.with_suffix(".txt").write_text(line)
-    arguments = ["evaluate", str(tmp_path), "--model", str(small_model), "--image-size", "64"]
+    arguments = ["learn", "evaluate", str(tmp_path), "--model", str(small_model), "--image-size", "64"]
     sheet = tmp_path / "out" / "misses.png"
     result = CliRunner().invoke(app, [*arguments, "--misses", str(sheet), "--json"])
     assert result.exit_code == 0, result.stderr
@@ -86,7 +86,9 @@ def test_command_writes_json_and_image(tmp_path: Path, small_model: Path) -> Non
     assert cv2.imread(str(sheet)) is not None
     result = CliRunner().invoke(app, [*arguments, "--misses", str(sheet)])
     assert "mAP50-95" in result.stdout
-    result = CliRunner().invoke(app, ["evaluate", str(tmp_path / "none"), "--model", str(small_model)])
+    result = CliRunner().invoke(
+        app, ["learn", "evaluate", str(tmp_path / "none"), "--model", str(small_model)]
+    )
     assert result.exit_code == 2
     assert f"{tmp_path / 'none'}: " in result.stderr
     assert "such file " in result.stderr
@@ -118,6 +120,6 @@ def test_detect_and_evaluate_with_tiles(tmp_path: Path, small_model: Path, image
     assert cv2.imwrite(str(image), np.zeros((120, 160, 3), np.uint8))
     image.with_suffix(".txt").write_text("0 0.5 0.5 0.5 0.5\n")
     misses = ["--misses", str(tmp_path / "m.png"), "--json"]
-    result = CliRunner().invoke(app, ["evaluate", str(tmp_path), *options, *misses])
+    result = CliRunner().invoke(app, ["learn", "evaluate", str(tmp_path), *options, *misses])
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["tiles"] is True

@@ -1,4 +1,4 @@
-"""A few training steps as by `companion train`, on scenes and on labelled images: the model can be used."""
+"""A few steps of `companion learn train`, on scenes and on labelled images: the model can be used."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ SHORT = ("--image-size", "64", "--batch-size", "2", "--workers", "0")
 
 
 def train_command(data: Path, model: Path | str, output: Path, *options: str) -> Result:
-    arguments = ["train", "--data", str(data), "--from", str(model), "--output", str(output)]
+    arguments = ["learn", "train", "--data", str(data), "--from", str(model), "--output", str(output)]
     return CliRunner().invoke(app, [*arguments, *SHORT, *options])
 
 
@@ -171,7 +171,7 @@ def test_existing_state_or_output_is_kept(
     if own_data:
         result = train_command(labelled, small_model, output, "--steps", "1")
     else:
-        result = CliRunner().invoke(app, ["train", "--output", str(output), "--steps", "1"])
+        result = CliRunner().invoke(app, ["learn", "train", "--output", str(output), "--steps", "1"])
     assert result.exit_code == 2
     assert len(result.stderr.splitlines()) == 1
     assert existing in result.stderr
@@ -191,7 +191,7 @@ def test_output_that_is_the_start_is_refused(
     if own_data:
         result = train_command(labelled, start, link / "mine", "--steps", "1", "--resume")
     else:
-        arguments = ["train", "--from", str(start), "--output", str(link / "mine"), "--resume"]
+        arguments = ["learn", "train", "--from", str(start), "--output", str(link / "mine"), "--resume"]
         result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 2
     assert len(result.stderr.splitlines()) == 1
@@ -256,13 +256,6 @@ def test_set_without_objects_is_refused(labelled: Path, small_model: Path, tmp_p
     assert result.exit_code == 2
     assert "no object " in result.stderr
     assert "its 4 images" in result.stderr
-
-
-def test_option_for_own_data_without_data_is_refused(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["train", "--output", str(tmp_path / "m"), "--batch-size", "4"])
-    assert result.exit_code == 2
-    assert "--batch-size is " in result.stderr
-    assert "of --data, " in result.stderr
 
 
 @pytest.mark.slow

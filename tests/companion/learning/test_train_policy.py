@@ -1,4 +1,4 @@
-"""`companion train-policy`: seeded and resumable, and what it writes can be flown."""
+"""`companion learn train --policy`: seeded and resumable, and what it writes can be flown."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_same_seed_gives_the_same_file_and_another_does_not(tmp_path: Path) -> N
 
 
 def test_policies_of_many_seeds_are_those_of_each_seed(tmp_path: Path) -> None:
-    command = ["train-policy", "companion/CartPole-v0", "--steps", "256"]
+    command = ["learn", "train", "--policy", "companion/CartPole-v0", "--steps", "256"]
     output, alone = tmp_path / "policy.onnx", tmp_path / "alone.onnx"
     several = [*command, "--seeds", "3,5", "--output", str(output)]
     result = CliRunner().invoke(app, several)
@@ -92,7 +92,7 @@ def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pyte
         raise RuntimeError("policy 7")
 
     monkeypatch.setattr(trainer, "judge", fails)
-    command = ["train-policy", "companion/CartPole-v0", "--steps", "256", "--seeds", "3"]
+    command = ["learn", "train", "--policy", "companion/CartPole-v0", "--steps", "256", "--seeds", "3"]
     result = CliRunner().invoke(app, [*command, "--output", str(tmp_path / "policy.onnx")])
     assert result.exit_code == 2
     trained, failed = result.stderr.splitlines()
@@ -167,7 +167,17 @@ class _Runs:
 
 def test_state_that_is_no_training_is_refused_and_runs_nothing(tmp_path: Path) -> None:
     file, state = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training" / "state.pt"
-    command = ["train-policy", "companion/CartPole-v0", "--steps", "512", "--resume", "--output", str(file)]
+    command = [
+        "learn",
+        "train",
+        "--policy",
+        "companion/CartPole-v0",
+        "--steps",
+        "512",
+        "--resume",
+        "--output",
+        str(file),
+    ]
     train_policy(CART_POLE, 256, file)
     whole, run = torch.load(state, weights_only=True), tmp_path / "run"
 
@@ -228,7 +238,7 @@ def test_unknown_environment_or_algorithm_is_refused_in_one_line(tmp_path: Path)
         (["companion/Car-v0"], "unknown environment 'companion/Car-v0'; there are: companion/"),
         (["companion/CartPole-v0", "--algorithm", "dqn"], "unknown algorithm 'dqn'; there are: ppo, sac"),
     ):
-        result = CliRunner().invoke(app, ["train-policy", *arguments, *output])
+        result = CliRunner().invoke(app, ["learn", "train", "--policy", *arguments, *output])
         assert result.exit_code == 2
         assert words in result.stderr
         assert len(result.stderr.splitlines()) == 1
@@ -238,9 +248,9 @@ def test_unknown_environment_or_algorithm_is_refused_in_one_line(tmp_path: Path)
 def test_missing_extra_is_named_and_help_does_not_need_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
     monkeypatch.delitem(sys.modules, "companion.learning.train_policy")  # imported without it
-    shown = CliRunner().invoke(app, ["train-policy", "--help"])
+    shown = CliRunner().invoke(app, ["learn", "train", "--help"])
     assert "--algorithm" in shown.stdout
-    done = CliRunner().invoke(app, ["train-policy", "companion/CartPole-v0"])
+    done = CliRunner().invoke(app, ["learn", "train", "--policy", "companion/CartPole-v0"])
     assert done.exit_code == 2
     assert "mavlink-companion[learn]" in done.stderr
     assert len(done.stderr.splitlines()) == 1

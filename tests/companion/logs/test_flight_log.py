@@ -86,7 +86,7 @@ def test_list_has_a_line_for_each_file_and_one_for_a_bad_one(path: Path, tmp_pat
     (tmp_path / "a.mcap").write_bytes(path.read_bytes())
     (tmp_path / "b.mcap").write_bytes(path.read_bytes()[:1000])
     (tmp_path / "c.mcap").touch()
-    done = companion_here("log", "list", tmp_path, "--json", cwd=tmp_path)
+    done = companion_here("log", "show", tmp_path, "--json", cwd=tmp_path)
     assert done.returncode == 0
     found = [json.loads(line) for line in done.stdout.splitlines()]
     assert [Path(each["path"]).name for each in found] == ["a.mcap", "b.mcap"]
@@ -109,12 +109,12 @@ def test_a_recording_without_an_end_is_not_called_damaged(path: Path, tmp_path: 
     # The length of a record; the end is there.
     length = first.chunk_start_offset + 8
     (tmp_path / "d.mcap").write_bytes(content[:length] + b"\x7f" + content[length + 1 :])
-    done = companion_here("log", "list", tmp_path, cwd=tmp_path)
+    done = companion_here("log", "show", tmp_path, cwd=tmp_path)
     states = [line.rpartition("  ")[2] for line in done.stdout.splitlines()]
     assert states == ["not ended", "not ended", "damaged", "damaged"]
     found = [
         json.loads(line)
-        for line in companion_here("log", "list", tmp_path, "--json", cwd=tmp_path).stdout.splitlines()
+        for line in companion_here("log", "show", tmp_path, "--json", cwd=tmp_path).stdout.splitlines()
     ]
     assert [each["ended"] for each in found] == [False, False, True, True]
     shown = companion_here("log", "show", tmp_path / "a.mcap", cwd=tmp_path).stdout.splitlines()
@@ -124,14 +124,14 @@ def test_a_recording_without_an_end_is_not_called_damaged(path: Path, tmp_path: 
 
 def test_recover_writes_a_complete_file(path: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])  # in the summary: no message is lost
-    done = companion_here("log", "recover", "cut.mcap", "whole.mcap", cwd=tmp_path)
+    done = companion_here("log", "convert", "cut.mcap", "whole.mcap", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     with (tmp_path / "whole.mcap").open("rb") as whole:
         found = list(make_reader(whole).iter_messages())
     assert len(found) == len(list(RecordingReader(path).messages()))
 
 
-@pytest.mark.parametrize("command", [("list", "none"), ("show", "none"), ("recover", "none", "x.mcap")])
+@pytest.mark.parametrize("command", [("show", "none"), ("convert", "none", "x.mcap")])
 def test_missing_path_is_one_line(command: tuple[str, ...], tmp_path: Path) -> None:
     done = companion_here("log", *command, cwd=tmp_path)
     assert done.returncode == 2
@@ -141,7 +141,7 @@ def test_missing_path_is_one_line(command: tuple[str, ...], tmp_path: Path) -> N
 
 @pytest.mark.realtime  # it waits for the service
 def test_record_without_a_service_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:
-    done = companion("record", "out", "--connect", "tcp/127.0.0.1:9", cwd=tmp_path)
+    done = companion("log", "record", "out", "--connect", "tcp/127.0.0.1:9", cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert list(tmp_path.iterdir()) == []

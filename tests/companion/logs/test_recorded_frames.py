@@ -120,5 +120,5 @@ def test_damaged_depth_is_refused_with_its_file_and_topic(
         list(recorded_frames(files, depth=True))
     assert str(refused.value).startswith(f"{damaged}: /depth_image: ")
     assert reason in str(refused.value)
-    done = companion_here("replay", *files, "--model", DEFAULT_MODEL, cwd=tmp_path)
+    done = companion_here("log", "replay", *files, "--model", DEFAULT_MODEL, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (2, f"companion: {refused.value}\n")

@@ -73,7 +73,7 @@ def test_replay_equals_in_another_process(flown: Path, replayed: Replay, tmp_pat
     """Sets of texts have another order there."""
     other_seed = "2" if os.environ.get("PYTHONHASHSEED") == "1" else "1"
     done = subprocess.run(
-        [sys.executable, "-m", "companion.cli", "replay", flown, "--json"],
+        [sys.executable, "-m", "companion.cli", "log", "replay", flown, "--json"],
         env=os.environ | {"PYTHONHASHSEED": other_seed},
         cwd=tmp_path,
         capture_output=True,
@@ -85,7 +85,7 @@ def test_replay_equals_in_another_process(flown: Path, replayed: Replay, tmp_pat
 
 def test_changed_setting_is_named_with_the_first_difference(flown: Path, tmp_path: Path) -> None:
     done = companion_here(
-        "replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", "--json", cwd=tmp_path
+        "log", "replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", "--json", cwd=tmp_path
     )
     assert done.returncode == 1, done.stderr
     found = json.loads(done.stdout)
@@ -95,7 +95,9 @@ def test_changed_setting_is_named_with_the_first_difference(flown: Path, tmp_pat
     assert found["first"]["field"].startswith("setpoint.")
     assert found["first"]["recorded"] != found["first"]["replayed"]
     assert 0 < found["differing_steps"] <= found["steps"]
-    lines = companion_here("replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", cwd=tmp_path)
+    lines = companion_here(
+        "log", "replay", flown, "--set", "guidance.max_horizontal_speed_mps=0.5", cwd=tmp_path
+    )
     assert f"step {found['first']['step']}," in lines.stdout
 
 
@@ -190,7 +192,7 @@ def test_parts_are_replayed_together(flown: Path, replayed: Replay, tmp_path: Pa
 
 def test_recording_of_another_version_is_one_line(flown: Path, tmp_path: Path) -> None:
     other = changed_run(flown, tmp_path, layout="0" * 12, version="9.9.9")
-    done = companion_here("replay", other, cwd=tmp_path)
+    done = companion_here("log", "replay", other, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "9.9.9" in done.stderr
@@ -201,7 +203,7 @@ def test_unknown_command_is_one_line(flown: Path, tmp_path: Path) -> None:
         text = message.data.replace(b'"text":"goto forward=900 right=0"', b'"text":"circle"')
         return message._replace(data=text)
 
-    done = companion_here("replay", rewritten(flown, tmp_path, change), cwd=tmp_path)
+    done = companion_here("log", "replay", rewritten(flown, tmp_path, change), cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "circle" in done.stderr
@@ -210,7 +212,7 @@ def test_unknown_command_is_one_line(flown: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"", b"text", b"\x89MCAP0\r\n"])
 def test_file_without_recording_is_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "file.mcap").write_bytes(content)
-    done = companion_here("replay", "file.mcap", cwd=tmp_path)
+    done = companion_here("log", "replay", "file.mcap", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("companion: file.mcap: ")
     assert len(done.stderr.splitlines()) == 1

@@ -171,7 +171,7 @@ def test_jpeg_replays_are_equal_and_say_what_images_change(jpeg: Path) -> None:
 def test_model_without_detections_explains_other_setpoints(
     lossless: Path, short: Path, small_model: Path, tmp_path: Path
 ) -> None:
-    done = companion_here("replay", lossless, "--model", small_model, "--json", cwd=tmp_path)
+    done = companion_here("log", "replay", lossless, "--model", small_model, "--json", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
     found = json.loads(done.stdout)
     assert found["detections"]["same_model"] is False
@@ -279,7 +279,7 @@ def test_unusable_images_are_refused(jpeg: Path, tmp_path: Path, what: str) -> N
 
 
 def test_unknown_model_is_one_line(short: Path, tmp_path: Path) -> None:
-    done = companion_here("replay", short, "--model", "none.pt", cwd=tmp_path)
+    done = companion_here("log", "replay", short, "--model", "none.pt", cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
     assert "none.pt" in done.stderr

@@ -1,4 +1,4 @@
-"""`companion sightings`: the objects of a recording as GeoJSON and KML."""
+"""`companion log show --objects`: the objects of a recording as GeoJSON and KML."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def changing(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_object_is_one_sighting_however_often_its_track_changes(changing: Path, tmp_path: Path) -> None:
-    done = companion_here("sightings", changing, "--geojson", cwd=tmp_path)
+    done = companion_here("log", "show", changing, "--objects", "geojson", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     car, ellipse = json.loads(done.stdout)["features"]
     assert car["properties"]["object_id"] == ellipse["properties"]["object_id"] == 5
@@ -119,7 +119,7 @@ def test_object_is_one_sighting_however_often_its_track_changes(changing: Path, 
     assert car["properties"]["first_seen"] == "2026-09-21T14:13:21.000Z"
     assert car["properties"]["last_seen"] == "2026-09-21T14:13:29.000Z"
     assert car["properties"]["seen"] == 20 + 20 + 20
-    done = companion_here("sightings", changing, "--kml", cwd=tmp_path)
+    done = companion_here("log", "show", changing, "--objects", "kml", cwd=tmp_path)
     (placemark,) = ElementTree.fromstring(done.stdout).iter(f"{KML}Placemark")
     assert placemark.findtext(f"{KML}name") == "car 8"
     data = {each.get("name"): each.findtext(f"{KML}value") for each in placemark.iter(f"{KML}Data")}
@@ -127,7 +127,7 @@ def test_object_is_one_sighting_however_often_its_track_changes(changing: Path, 
 
 
 def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
-    done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
+    done = companion_here("log", "show", path, "--objects", "geojson", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout)
     assert found["type"] == "FeatureCollection"
@@ -161,7 +161,7 @@ def test_geojson_has_each_track_once(path: Path, tmp_path: Path) -> None:
 
 
 def test_ellipse_is_a_closed_counterclockwise_ring(path: Path, tmp_path: Path) -> None:
-    done = companion_here("sightings", path, "--geojson", cwd=tmp_path)
+    done = companion_here("log", "show", path, "--objects", "geojson", cwd=tmp_path)
     (first, *_) = [f for f in json.loads(done.stdout)["features"] if f["properties"].get("error_ellipse")]
     assert first["properties"] == {"object_id": None, "track_ids": [1], "error_ellipse": 0.95}
     (ring,) = first["geometry"]["coordinates"]
@@ -176,7 +176,7 @@ def test_ellipse_is_a_closed_counterclockwise_ring(path: Path, tmp_path: Path) -
 
 
 def test_kml_has_points_times_and_ellipses(path: Path, tmp_path: Path) -> None:
-    done = companion_here("sightings", path, "--kml", cwd=tmp_path)
+    done = companion_here("log", "show", path, "--objects", "kml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     root = ElementTree.fromstring(done.stdout)
     assert root.tag == f"{KML}kml"
@@ -196,7 +196,7 @@ def test_kml_has_points_times_and_ellipses(path: Path, tmp_path: Path) -> None:
     assert (data["class_name"], data["semi_major_m"]) == ("car", "2.0")
 
 
-def test_bad_input_is_one_line_and_exit_code_two(path: Path, tmp_path: Path) -> None:
+def test_bad_input_is_one_line_and_exit_code_two(tmp_path: Path) -> None:
     other = tmp_path / "notes.mcap"
     other.write_text("not a recording")
     writer, converter = new_writer(tmp_path / "odd"), Converter("vehicle1")
@@ -204,13 +204,11 @@ def test_bad_input_is_one_line_and_exit_code_two(path: Path, tmp_path: Path) -> 
         writer.write(*converted)
     writer.close()
     for arguments, words in (
-        ((path,), "--geojson"),
-        ((path, "--geojson", "--kml"), "--geojson"),
-        ((tmp_path / "none.mcap", "--kml"), "none.mcap"),
-        ((other, "--geojson"), "not an MCAP file"),
-        ((writer.path, "--geojson"), "class_name"),
+        ((tmp_path / "none.mcap", "kml"), "none.mcap"),
+        ((other, "geojson"), "not an MCAP file"),
+        ((writer.path, "geojson"), "class_name"),
     ):
-        done = companion_here("sightings", *arguments, cwd=tmp_path)
+        done = companion_here("log", "show", "--objects", arguments[1], arguments[0], cwd=tmp_path)
         assert done.returncode == 2
         assert done.stdout == ""
         assert len(done.stderr.splitlines()) == 1
@@ -220,5 +218,5 @@ def test_bad_input_is_one_line_and_exit_code_two(path: Path, tmp_path: Path) -> 
 def test_recording_without_tracks_gives_an_empty_collection(tmp_path: Path) -> None:
     writer = new_writer(tmp_path / "empty")
     writer.close()
-    done = companion_here("sightings", writer.path, "--geojson", cwd=tmp_path)
+    done = companion_here("log", "show", writer.path, "--objects", "geojson", cwd=tmp_path)
     assert (done.returncode, json.loads(done.stdout)["features"]) == (0, [])

@@ -37,20 +37,20 @@ def test_list_has_bundled_local_and_official_models(folder: Path, small_model: P
     folder.mkdir()
     shutil.copy(small_model, folder / "mine.pt")
     (folder / "yolov8n.pt").write_bytes(b"x")
-    listed = json.loads(run("list", "--json"))
+    listed = json.loads(run("show", "--json"))
     states = {row["name"]: row["state"] for row in listed["models"]}
     assert (states["default"], states["mine.pt"]) == ("bundled", "here")
     assert states["yolov8n"] == "here"
     assert states["yolo26x"] == "can be pulled"
-    assert "yolo11n" in run("list")
+    assert "yolo11n" in run("show")
     assert [path.name for path in kept_models()] == ["mine.pt", "yolov8n.pt"]
 
 
 def test_list_has_permissive_licences_first(folder: Path) -> None:
-    licences = [row["licence"] for row in json.loads(run("list", "--json"))["models"]]
+    licences = [row["licence"] for row in json.loads(run("show", "--json"))["models"]]
     assert licences == sorted(licences, key=lambda licence: licence != "Apache-2.0")
     assert licences.count("Apache-2.0") == 4
-    assert run("list").splitlines()[1].startswith("Apache-2.0")
+    assert run("show").splitlines()[1].startswith("Apache-2.0")
 
 
 @pytest.mark.parametrize(
@@ -59,8 +59,8 @@ def test_list_has_permissive_licences_first(folder: Path) -> None:
         (["detect", "photo.jpg", "--model", "yolov8n"], "companion models pull yolov8n"),
         (["detect", "photo.jpg", "--model", "yolov8n.pt"], "companion models pull yolov8n"),
         (["detect", "photo.jpg", "--model", "yolox_s.onnx"], "companion models pull yolox_s"),
-        (["detect", "photo.jpg", "--model", "other"], "companion models list"),
-        (["models", "verify", "yolo11n", "yolo11n.onnx"], "companion models pull yolo11n"),
+        (["detect", "photo.jpg", "--model", "other"], "companion models show"),
+        (["models", "show", "yolo11n", "--compare", "yolo11n.onnx"], "companion models pull yolo11n"),
     ],
 )
 def test_missing_name_says_how_to_get_a_model(folder: Path, arguments: list[str], command: str) -> None:
@@ -78,7 +78,7 @@ def test_bare_name_is_found_in_models_folder(folder: Path, small_model: Path) ->
     assert find_model(small_model) == small_model
     assert find_model("other") == Path("other")
     assert find_model("./mine.pt") == Path("mine.pt")
-    assert json.loads(run("info", "mine", "--json"))["file"] == str(folder / "mine.pt")
+    assert json.loads(run("show", "mine", "--json"))["file"] == str(folder / "mine.pt")
 
 
 @pytest.fixture
@@ -102,7 +102,7 @@ def test_model_in_system_folder_is_found_by_all(two_folders: tuple[Path, Path]) 
         (own / name).write_bytes(b"own")
     assert find_model("both") == own / "both.pt"
     assert kept_models() == [own / "both.pt", own / "own.onnx", system / "pulled.pt"]
-    rows = json.loads(run("list", "--json"))["models"]
+    rows = json.loads(run("show", "--json"))["models"]
     assert {row["path"] for row in rows if row["state"] == "here"} == set(map(str, kept_models()))
 
 
@@ -130,7 +130,7 @@ def test_unreadable_folder_does_not_hide_the_next(two_folders: tuple[Path, Path]
 
 
 def test_info_describes_model() -> None:
-    facts = json.loads(run("info", "default", "--runtime", "torch", "--json"))
+    facts = json.loads(run("show", "default", "--runtime", "torch", "--json"))
     assert facts["model_family"] == "YOLOv8"
     assert facts["licence"] == "Apache-2.0"
     assert facts["classes"][0] == "person"
@@ -141,7 +141,7 @@ def test_info_describes_model() -> None:
     assert facts["official"] is None
     assert facts["runtime"] == "torch"
     assert facts["precision"] in ("float32", "bfloat16")
-    output = run("info", "default", "--runtime", "torch")
+    output = run("show", "default", "--runtime", "torch")
     # It is measured again; with equal timings the choice may differ.
     assert re.search(r"\b(float32|bfloat16) \((measured|this processor)", output)
     assert "Apache-2.0" in output
@@ -149,7 +149,7 @@ def test_info_describes_model() -> None:
 
 
 def test_info_of_the_bundled_model_is_that_of_its_export() -> None:
-    facts = json.loads(run("info", "default", "--json"))
+    facts = json.loads(run("show", "default", "--json"))
     assert (facts["kind"], facts["runtime"], facts["licence"]) == ("onnx", "onnxruntime", "Apache-2.0")
     assert facts["sha256"] == weights_sha256(DEFAULT_EXPORT)
 
@@ -174,14 +174,14 @@ def package_files() -> set[tuple[str, int]]:
 
 
 def test_unknown_runtime_is_an_error() -> None:
-    result = CliRunner().invoke(app, ["models", "info", "default", "--runtime", "abacus"])
+    result = CliRunner().invoke(app, ["models", "show", "default", "--runtime", "abacus"])
     assert result.exit_code == 2
     assert "runtime" in result.stderr
     assert "torch" in result.stderr
 
 
 def test_missing_model_or_unknown_format_is_an_error(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["models", "info", str(tmp_path / "none.pt")])
+    result = CliRunner().invoke(app, ["models", "show", str(tmp_path / "none.pt")])
     assert result.exit_code == 2
     assert f"{tmp_path / 'none.pt'}: " in result.stderr
     assert "such file" in result.stderr
@@ -209,7 +209,7 @@ def test_verify_compares_export_with_source(
     exported = tmp_path / "small.torchscript"
     run("export", small_model, "--to", "torchscript", "--output", exported, "--image-size", 64)
     options = ["--image-size", "96", "--count", "1", "--json"]
-    parity = json.loads(run("verify", small_model, exported, *options))
+    parity = json.loads(run("show", small_model, "--compare", exported, *options))
     assert parity["holds"]
     assert parity["same_source"]
     assert parity["images"] == 1
@@ -221,16 +221,16 @@ def test_verify_compares_export_with_source(
             parameter.mul_(1.1)
     other = tmp_path / "other.safetensors"
     save_checkpoint(other, loaded.model, metadata={})
-    result = CliRunner().invoke(app, ["models", "verify", str(other), str(exported), *options])
+    result = CliRunner().invoke(app, ["models", "show", str(other), "--compare", str(exported), *options])
     assert result.exit_code == 1
     parity = json.loads(result.stdout)
     assert not parity["holds"]
     assert not parity["same_source"]
     # Models that cannot be compared are refused before scenes are rendered.
     monkeypatch.setattr(companion.models.verify, "random_scene", None)
-    result = CliRunner().invoke(app, ["models", "verify", "default", str(exported), *options])
+    result = CliRunner().invoke(app, ["models", "show", "default", "--compare", str(exported), *options])
     assert result.exit_code == 2
     assert "strides" in result.stderr
-    result = CliRunner().invoke(app, ["models", "verify", str(small_model), str(small_model)])
+    result = CliRunner().invoke(app, ["models", "show", str(small_model), "--compare", str(small_model)])
     assert result.exit_code == 2
     assert "models export" in result.stderr

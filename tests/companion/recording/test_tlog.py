@@ -63,7 +63,7 @@ def test_datagrams_of_both_directions_are_in_order_of_time(tmp_path: Path) -> No
         (SENT if number % 3 == 0 else RECEIVED, BEGIN_NS + number * 1_234_567, frame)
         for number, frame in enumerate(frames)
     ]
-    done = companion_here("log", "tlog", record(tmp_path, pieces), tmp_path / "out.tlog", cwd=tmp_path)
+    done = companion_here("log", "convert", record(tmp_path, pieces), tmp_path / "out.tlog", cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     found = read_with_pymavlink(tmp_path / "out.tlog")
     assert [frame for _, frame in found] == frames
@@ -118,11 +118,11 @@ def test_tlog_of_a_px4_flight_is_written_as_it_was(tmp_path: Path) -> None:
     assert len(pieces) > 10_000
 
 
-def test_output_is_never_overwritten_and_has_the_recordings_name(tmp_path: Path) -> None:
+def test_output_is_never_overwritten(tmp_path: Path) -> None:
     path = record(tmp_path, [(SENT, BEGIN_NS, messages(1, 1)[0])])
-    assert companion_here("log", "tlog", path, cwd=tmp_path).returncode == 0
+    assert companion_here("log", "convert", path, path.with_suffix(".tlog"), cwd=tmp_path).returncode == 0
     content = path.with_suffix(".tlog").read_bytes()
-    again = companion_here("log", "tlog", path, cwd=tmp_path)
+    again = companion_here("log", "convert", path, path.with_suffix(".tlog"), cwd=tmp_path)
     assert (again.returncode, len(again.stderr.splitlines())) == (2, 1)
     assert str(path.with_suffix(".tlog")) in again.stderr
     assert path.with_suffix(".tlog").read_bytes() == content
@@ -130,6 +130,6 @@ def test_output_is_never_overwritten_and_has_the_recordings_name(tmp_path: Path)
 
 def test_recording_without_mavlink_is_refused(tmp_path: Path) -> None:
     path = record(tmp_path, [(Channel("events"), BEGIN_NS, b"{}")])
-    done = companion_here("log", "tlog", path, cwd=tmp_path)
+    done = companion_here("log", "convert", path, path.with_suffix(".tlog"), cwd=tmp_path)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert not path.with_suffix(".tlog").exists()

@@ -227,7 +227,9 @@ def test_mission_is_flown_and_flight_survives_a_killed_worker(seeing: list[str],
         assert reply["steps"] == []
         service.take_off(2.5)
         # The service cannot access the file: its text is sent with the command.
-        done = companion_here("mission", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here")
+        done = companion_here(
+            "send", "--file", "short.toml", "--connect", service.endpoint, cwd=tmp_path / "here"
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         assert done.stdout.splitlines()[-1] == "done: flown, 3 steps"
         service.wait_for_line("mission around: step 3 of 3: orbit", 5.0)

@@ -80,7 +80,7 @@ def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "ray", None)
     for command in (
         ["demo", "--seeds", "1..2"],
-        ["train-policy", "companion/CartPole-v0", "--seeds", "1..2"],
+        ["learn", "train", "--policy", "companion/CartPole-v0", "--seeds", "1..2"],
     ):
         result = CliRunner().invoke(app, [*command, "--ray", "127.0.0.1:6379"])
         assert result.exit_code == 2
@@ -88,7 +88,7 @@ def test_missing_ray_is_one_line_that_names_the_extra(monkeypatch: pytest.Monkey
         assert len(result.stderr.splitlines()) == 1
 
 
-@pytest.mark.parametrize("command", [["demo"], ["train-policy", "companion/CartPole-v0"]])
+@pytest.mark.parametrize("command", [["demo"], ["learn", "train", "--policy", "companion/CartPole-v0"]])
 @pytest.mark.parametrize(
     ("options", "named"),
     [

@@ -92,7 +92,7 @@ def test_evaluation_of_int8_file_needs_no_precision(
     assert cv2.imwrite(str(tmp_path / "a.png"), make_image(72, SIDE))
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.5 0.5\n")
     options = ["--model", str(path), "--runtime", name, "--image-size", str(SIDE), "--json"]
-    arguments = ["evaluate", str(tmp_path), *options, "--misses", str(tmp_path / "misses.png")]
+    arguments = ["learn", "evaluate", str(tmp_path), *options, "--misses", str(tmp_path / "misses.png")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["precision"] == "int8"

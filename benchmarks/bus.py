@@ -1,8 +1,16 @@
-"""The bus under load, measured on this machine: time from put to a subscriber in another process."""
+"""The bus under load, measured on this machine: time from put to a subscriber in another process.
+
+    python -m benchmarks.bus --seconds 10 --rate-hz 30
+    python -m benchmarks.bus --recovered 100000
+
+Detectors use every core beside it. A recovered topic is one whose lost messages zenoh sends again.
+"""
 
 from __future__ import annotations
 
+import argparse
 import asyncio
+import json
 import multiprocessing
 import os
 import socket
@@ -14,7 +22,7 @@ from contextlib import asynccontextmanager
 from multiprocessing.connection import Connection
 from pathlib import Path
 from subprocess import DEVNULL
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -24,7 +32,7 @@ from companion.bench.percentiles import percentiles
 from companion.bus import topics
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.client import client_settings, open_client, subscribe_kept
-from companion.bus.session import Bus, encode
+from companion.bus.session import Bus, BusError, encode
 from companion.host.peer_data import copy_payload, parse_object
 from companion.host.scheduling import schedule_as_any_program, set_scheduler_slice
 from companion.perception.messages import Report, StartFailed
@@ -377,3 +385,34 @@ def _detections(sequence: int) -> DetectionsBody:
         "detections": [car] * DETECTIONS,
         "objects": [seen] * DETECTIONS,
     }
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rate-hz", type=float, default=30.0, help="Messages a second.")
+    cores = len(os.sched_getaffinity(0))
+    parser.add_argument("--load", type=int, default=cores, help="Number of detectors beside it.")
+    parser.add_argument("--priority", choices=get_args(Priority), default="low", help="As detector.priority.")
+    parser.add_argument(
+        "--recovered", type=int, help="Instead publish so many messages of a recovered topic."
+    )
+    arguments = parser.parse_args()
+    try:
+        if arguments.recovered is not None:
+            figures = measure_recovery(arguments.recovered)
+        else:
+            figures = measure_bus(
+                arguments.seconds,
+                rate_hz=arguments.rate_hz,
+                load=arguments.load,
+                priority=arguments.priority,
+            )
+    except (BusError, OSError, RuntimeError) as error:
+        parser.exit(2, f"{error}\n")
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    main()
