@@ -58,7 +58,7 @@ class SourceSection(Section):
     depth_scale: Annotated[float | None, Field(gt=0, le=1000)] = None
     """metres per unit of depth; unset: 0.001 for 16-bit integers, 1 for floats"""
     depth_calibration_file: Annotated[str | None, Field(min_length=1)] = None
-    """calibration of a depth camera that is not registered, as companion calibrate extrinsics writes it"""
+    """calibration of a depth camera that is not registered, as companion calibrate writes it"""
     loop: bool = False
     """repeat a file or folder; not with depth"""
     every_frame: bool = False

@@ -26,7 +26,7 @@ class VehicleSection(Section):
     name: KeyWord = "vehicle1"
     """the vehicle's name in zenoh keys: companion/NAME/detections"""
     connect_timeout_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
-    """how long play, demo and preview wait for the first heartbeat, seconds; run waits without limit"""
+    """how long play, demo and detect wait for the first heartbeat, seconds; run waits without limit"""
     allow_other_commander: bool = False
     """fly even if another service commands the same vehicle; by default the later one refuses"""
     signing_key_file: str | None = None
