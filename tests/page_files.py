@@ -65,8 +65,8 @@ def put_coco(path: Path) -> None:
 def put_pulled_model(path: Path) -> None:
     """What `companion models pull` leaves; the network is smaller."""
     from tests.vision.foreign_checkpoints import SMALL, trained_model
+    from vision.training.published import yolov8_description
     from vision.yolo.checkpoint import save_checkpoint
-    from vision.yolo.published import yolov8_description
 
     path.parent.mkdir(parents=True, exist_ok=True)
     save_checkpoint(path, trained_model(yolov8_description(SMALL, ("person", "car"))), metadata={})

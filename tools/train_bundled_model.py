@@ -47,12 +47,12 @@ from mavlink_sim.world.shapes import CLASS_NAMES
 from vision.detector import RENDERED_SCENES
 from vision.evaluation.metrics import operating_points
 from vision.training.losses import Truth, detection_loss
+from vision.training.published import yolov8_description
 from vision.training.recipe import HELD_OUT_SEED, HELD_OUT_SIZE, NMS_IOU, REFINEMENT, evaluate
 from vision.training.scene_batches import PADDING_GREY
 from vision.training.training import prepare_start, update_average
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
-from vision.yolo.published import yolov8_description
 
 WIDTH, HEIGHT = 640, 480
 """Pixels of a drawn scene."""

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.camera_tools.cloud_drawing import draw_cloud
 from companion.camera_tools.detect import PlainPart, Seen, Shown
 from companion.settings.perception import CameraSection
 from vision.point_cloud import (
@@ -22,7 +23,6 @@ from vision.point_cloud import (
     voxel_grid,
     write_cloud,
 )
-from vision.point_cloud.drawing import draw_cloud
 
 logger = logging.getLogger(__name__)
 

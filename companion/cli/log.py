@@ -88,9 +88,9 @@ def convert_recording(
     An .mcap has all that can be read of a damaged one. A .tlog has the MAVLink of both directions, for ground
     stations.
     """
+    from companion.logs.tlog import write_tlog
     from companion.recording import RecordingError
     from companion.recording.files import recover
-    from companion.recording.tlog import write_tlog
 
     if output.suffix not in (".mcap", ".tlog"):
         refuse(f"{output}: expected a name that ends in .mcap or .tlog")

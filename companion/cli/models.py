@@ -195,9 +195,9 @@ def export(
     from vision.exports.export import export
     from vision.model_files import models_folder
     from vision.runtimes.base import RuntimeUnusableError
+    from vision.training.published import model_family_of
     from vision.weights import DEFAULT_WEIGHTS
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
-    from vision.yolo.published import model_family_of
 
     path = _checkpoint(file)
     with plain_errors(CheckpointError, RuntimeUnusableError, ValueError, OSError):

@@ -65,8 +65,8 @@ def model_info(path: Path, image_size: int = 640, runtime: RuntimeChoice | None 
     if image_size < 32 or image_size % 32:
         raise ValueError(f"the image size must be a multiple of 32, got {image_size}")
     # They import torch.
+    from vision.training.published import describe
     from vision.yolo.checkpoint import load_checkpoint
-    from vision.yolo.published import describe
 
     loaded = load_checkpoint(path)
     weights = pair_paths(path)[0] if is_pair(path) else path

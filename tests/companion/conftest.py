@@ -57,9 +57,9 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
         import torch
 
         from vision.detector import RENDERED_SCENES
+        from vision.training.published import yolov8_description
         from vision.yolo.architecture import build
         from vision.yolo.checkpoint import save_checkpoint
-        from vision.yolo.published import yolov8_description
 
         torch.manual_seed(1)
         model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()

@@ -21,10 +21,10 @@ from mavlink_sim.world.shapes import CLASS_NAMES
 from tools import train_bundled_model
 from tools.train_bundled_model import LACKING, SIZES, Pool, PoolCopy, batch, join, lower_confidence, train
 from vision.evaluation.metrics import ImageResult
+from vision.training.published import yolov8_description
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
-from vision.yolo.published import yolov8_description
 
 RENDERERS = 2
 TRUCK, IGNORED_BOAT = 3, ~4

@@ -14,9 +14,9 @@ from typing import Any
 
 import torch
 
+from vision.training.published import yolov8_description
 from vision.yolo.architecture import build
 from vision.yolo.checkpoint import FORMAT
-from vision.yolo.published import yolov8_description
 
 DETECTION = "ultralytics.nn.tasks.DetectionModel"
 

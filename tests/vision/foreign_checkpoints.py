@@ -17,8 +17,8 @@ import pytest
 import torch
 from torch import nn
 
+from vision.training.published import yolov8_description
 from vision.yolo.architecture import ModelDescription, YoloModel, build
-from vision.yolo.published import yolov8_description
 
 Classes = dict[str, type[nn.Module]]
 """The foreign library's names, each with a class of that name."""

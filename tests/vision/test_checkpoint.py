@@ -24,6 +24,7 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
+from vision.training.published import SCALES, published_description, yolov8_description
 from vision.yolo.architecture import ModelDescription, build
 from vision.yolo.checkpoint import (
     FORMAT,
@@ -33,7 +34,6 @@ from vision.yolo.checkpoint import (
 )
 from vision.yolo.checkpoint_file import read_archive
 from vision.yolo.layers import Conv
-from vision.yolo.published import SCALES, published_description, yolov8_description
 
 pytestmark = pytest.mark.usefixtures("untried")
 

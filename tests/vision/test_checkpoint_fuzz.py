@@ -23,10 +23,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.vision.checkpoint_bombs import BOMBS, archive
+from vision.training.published import yolov8_description
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.architecture import build
 from vision.yolo.checkpoint import CheckpointError, load_checkpoint, save_checkpoint
-from vision.yolo.published import yolov8_description
 
 READER = Path(__file__).with_name("checkpoint_memory.py")
 ROOT = Path(__file__).parent.parent.parent

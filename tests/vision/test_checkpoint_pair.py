@@ -10,12 +10,12 @@ import pytest
 import torch
 import yaml
 
+from vision.training.published import yolov8_description
 from vision.weights import DEFAULT_WEIGHTS
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import load_checkpoint, save_checkpoint
 from vision.yolo.checkpoint_error import CheckpointError
 from vision.yolo.checkpoint_pair import read_safetensors, write_safetensors
-from vision.yolo.published import yolov8_description
 
 NAMES = ("no", "1:30", "Schaf")
 METADATA = {"licence": "Apache-2.0", "score": {"map50": 0.5, "per_class": [1, 2]}, "note": None}

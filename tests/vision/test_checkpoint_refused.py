@@ -30,6 +30,7 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
+from vision.training.published import yolov8_description
 from vision.yolo.checkpoint import (
     FORMAT,
     CheckpointError,
@@ -37,7 +38,6 @@ from vision.yolo.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from vision.yolo.published import yolov8_description
 
 pytestmark = pytest.mark.usefixtures("untried")
 

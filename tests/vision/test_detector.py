@@ -17,9 +17,9 @@ from vision import detector as detector_module
 from vision.detector import Detector
 from vision.object_detector import resolve_classes
 from vision.tracking.association import overlaps
+from vision.training.published import yolov8_description
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import CheckpointError, save_checkpoint
-from vision.yolo.published import yolov8_description
 
 NAMES = ("person", "bicycle", "car", "dog")
 TEST_DATA = Path(

@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from tests.vision.dense_decoding import decoded
+from vision.training.published import SCALES, _scale, describe, model_family_of, published_description
 from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build, build_shapes
 from vision.yolo.postprocess import select_boxes
-from vision.yolo.published import SCALES, _scale, describe, model_family_of, published_description
 
 COCO_SIZED = [f"class {index}" for index in range(80)]
 FEW = ("car", "dog", "boat")

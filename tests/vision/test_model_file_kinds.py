@@ -36,8 +36,8 @@ from tests.vision.test_yolov9 import FOREIGN_YOLOV9, described
 from tests.vision.test_yolox import save_yolox
 from vision.detector import Detector
 from vision.runtimes.source import read_source
+from vision.training.published import yolov8_description
 from vision.weights import DEFAULT_WEIGHTS
-from vision.yolo.published import yolov8_description
 
 needs("onnx", "onnxruntime", "openvino")
 

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.vision.dense_decoding import decoded
+from vision.training.published import yolov8_description
 from vision.yolo import postprocess
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.level_outputs import ClassRows, Head, LevelOutput
 from vision.yolo.postprocess import boxes_of, candidates_of, select_boxes, suppress
-from vision.yolo.published import yolov8_description
 
 NAMES = ("car", "dog", "boat")
 

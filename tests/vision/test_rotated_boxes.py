@@ -29,9 +29,9 @@ from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
 from vision.runtimes.source import runtime_of_file
 from vision.training.fine_tuning import extend_classes
+from vision.training.published import published_description
 from vision.yolo.architecture import ArchitectureError, build
 from vision.yolo.heads import OBB
-from vision.yolo.published import published_description
 
 OBB_FOREIGN = FOREIGN | {"OBB": "ultralytics.nn.modules.head", "OBBModel": "ultralytics.nn.tasks"}
 

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
+from vision.training.published import yolov8_description
 from vision.yolo.architecture import ArchitectureError, LayerSpec, ModelDescription, build
-from vision.yolo.published import yolov8_description
 
 SMALL = (0.1, 0.01, 64)
 

@@ -21,9 +21,9 @@ from tests.vision.foreign_checkpoints import (
     trained_model,
 )
 from tests.vision.test_model_families import FEW, facts, filled, make_image
+from vision.training.published import _scale, describe
 from vision.yolo.architecture import ArchitectureError, ModelDescription, build_shapes
 from vision.yolo.checkpoint import load_checkpoint
-from vision.yolo.published import _scale, describe
 
 FOREIGN_YOLOV9 = {
     **FOREIGN,

@@ -17,9 +17,9 @@ from vision.evaluation.datasets import Dataset, read_image
 from vision.letterbox import fit_into
 from vision.tracking.association import overlaps
 from vision.training.losses import BINS
+from vision.training.published import model_family_of
 from vision.training.scene_batches import KEPT_BYTES, NO_AUGMENTATION, LabelledImage, augment
 from vision.yolo.architecture import YoloModel, build
-from vision.yolo.published import model_family_of
 
 SURE_SCORE, DOUBTED_SCORE = 0.4, 0.1
 """Boxes that the starting model finds of a class without labels: an object from the first score, neither

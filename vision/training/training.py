@@ -18,10 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from vision.training.losses import DetectionLoss, detection_loss
+from vision.training.published import model_family_of, yolov8_description
 from vision.training.scene_batches import Augmentation, SceneKey, SceneSource, network_input, scene_batches
 from vision.yolo.architecture import YoloModel, build
 from vision.yolo.description import ModelDescription
-from vision.yolo.published import model_family_of, yolov8_description
 
 logger = logging.getLogger(__name__)
 

@@ -1,6 +1,7 @@
 """The network, built row by row from its description.
 
-`build` creates it with random weights. A description comes from a checkpoint or from `vision.yolo.published`.
+`build` creates it with random weights. A description comes from a checkpoint, or from
+`vision.training.published`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The description of a network: rows of (from, repeats, layer, arguments) and three multipliers.
 
-A checkpoint contains its description; `vision.yolo.published` has the published ones.
+A checkpoint contains its description; `vision.training.published` has the published ones.
 """
 
 from __future__ import annotations

@@ -10,9 +10,9 @@ from torch import Tensor
 from tests.vision.runtimes.conftest import NAMES, lively_model, make_image
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.network import Network
+from vision.training.published import yolov8_description
 from vision.yolo.architecture import build
 from vision.yolo.level_outputs import LevelOutput
-from vision.yolo.published import yolov8_description
 
 
 def whole_maps(image: np.ndarray) -> list[Tensor]:

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from vision.detections import Detections
 from vision.evaluation.datasets import Dataset, Sample
 from vision.training.fine_tuning import LabelledScenes, TrainingImage, extend_classes, training_images
+from vision.training.published import published_description
 from vision.yolo.architecture import YoloModel, build
-from vision.yolo.published import published_description
 
 NAMES = ("person", "traffic light")
 RED, GREEN = (0, 0, 255), (0, 255, 0)

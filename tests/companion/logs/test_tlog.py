@@ -12,9 +12,9 @@ import pytest
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
+from companion.logs.tlog import link_frames, write_tlog
 from companion.recording.convert import RECEIVED_CHANNEL, SENT_CHANNEL
 from companion.recording.files import Channel, RecordingReader
-from companion.recording.tlog import link_frames, write_tlog
 from tests.companion.command_line import companion_here
 from tests.companion.recording.lockstep_recording import new_writer
 
