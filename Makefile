@@ -29,26 +29,18 @@ for try in 1 2 3; do if timeout 600 sh -ec '$(2)'; then exit 0; fi; sleep $$((5 
 	echo "make programs: could not install $(1); the lines above say why" >&2; exit 1
 endef
 
-.PHONY: demo test computed alone realtime test-slow programs debian lint format clean
+.PHONY: demo test test-slow programs debian lint format clean
 
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
 
 # Hundreds of processes are started: bytecode is kept, whatever the environment says.
 test test-slow: export PYTHONDONTWRITEBYTECODE =
-# What computes fills the time in which what flies in real time waits, and gives way to it.
 test: $(READY)
-	@$(MAKE) --no-print-directory --jobs 2 --keep-going --output-sync=target computed realtime
-	@$(BIN)/python -m tests.programs
-
-computed: $(READY)
-	nice -n 19 $(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
-
-alone: $(READY)
 	$(BIN)/python -m pytest tests/alone -m "not slow" --reruns 1
-
-realtime: alone $(READY)
+	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) --dist worksteal -m "not realtime and not slow"
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "realtime and not slow" --reruns 1
+	@$(BIN)/python -m tests.programs
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest tests/alone -m slow
