@@ -57,7 +57,7 @@ def check_load(path: Path, runtime: RuntimeName) -> None:
     except OSError as error:
         raise RuntimeUnusableError(f"{path}: cannot be read: {error.strerror or error}") from error
     if done.returncode == -signal.SIGXCPU:
-        raise _harmful(path, f"{runtime} has not read it within {CHECKPOINT_S} s")
+        raise _harmful(path, f"{runtime} needs more than {CHECKPOINT_S} s of processor time to read it")
     if done.returncode == _TOO_LARGE:
         raise _harmful(path, f"{runtime} needs more than {_allowed(path, runtime) >> 20} MiB to load it")
     if done.returncode != 0:
