@@ -87,10 +87,3 @@ def test_score_as_plain_values() -> None:
     values = score(({1: 0}, {7: 0})).as_dict()
     assert values["mota"] == 1.0
     assert values["objects"] == 1
-
-
-def test_identities_must_differ_and_have_a_box_each() -> None:
-    with pytest.raises(ValueError, match=r"differ, got \[1, 1\]"):
-        Labelled([1, 1], np.zeros((2, 4)))
-    with pytest.raises(ValueError, match=r"must be \(1, 4\), got \(2, 4\)"):
-        Labelled([1], np.zeros((2, 4)))

@@ -69,11 +69,6 @@ def test_compiled_flights_equal_the_pure_ones(tmp_path: Path) -> None:
     assert compiled[1:] == pure[1:]
 
 
-def test_a_folder_that_exists_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(FileExistsError):
-        compile_simulator(tmp_path)
-
-
 if __name__ == "__main__":
     print(airframe.__file__)
     for seed in (1, 2, 3):

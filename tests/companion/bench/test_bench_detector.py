@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from companion.bench.detector import BenchError, measure_detectors, read_result, table
+from companion.bench.detector import measure_detectors, table
 from companion.cli import app
 
 
@@ -116,10 +116,3 @@ def test_what_cannot_be_measured_is_exit_code_2(
     result = CliRunner().invoke(app, [*common, *arguments])
     assert result.exit_code == 2
     assert expected in result.output
-
-
-@pytest.mark.parametrize("text", ["[]", "{}", '{"rows": [1]}', '{"rows": [{}]}'])
-def test_a_file_that_is_no_result_is_refused(tmp_path: Path, text: str) -> None:
-    (tmp_path / "r.json").write_text(text)
-    with pytest.raises(BenchError, match=r"r\.json: .*bench detector --json`"):
-        read_result(tmp_path / "r.json")

@@ -21,7 +21,7 @@ from companion.bus.messages import (
 )
 from companion.bus.vehicle_messages import geodetic_origin
 from companion.geometry.geodesy import GeodeticOrigin, north_east
-from companion.guidance.objects.from_detections import HistoryError, StateHistory, targets_from_detections
+from companion.guidance.objects.from_detections import StateHistory, targets_from_detections
 from companion.guidance.objects.table import ObjectTable
 from companion.guidance.objects.target import RangeSource, Target
 from companion.vehicle.gimbal import GimbalState
@@ -88,11 +88,6 @@ def test_transforms_lead_from_camera_to_ned(mount: CameraMount, frames: list[str
     ned_from_optical = (held if mount.on_gimbal else mount).ned_from_optical(ned_from_body)
     expected = np.array([30.0, -20.0, -5.0]) + ned_from_body @ mount.position_frd_m + ned_from_optical @ point
     np.testing.assert_allclose(in_ned(message, point), expected, atol=1e-3)
-
-
-def test_transforms_need_an_attitude() -> None:
-    with pytest.raises(HistoryError):
-        transforms_message(7, NOW_NS, CameraMount(), StateHistory(), "v")
 
 
 def test_camera_info_has_the_lens_and_the_mount() -> None:

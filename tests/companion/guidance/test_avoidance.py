@@ -18,7 +18,6 @@ from companion.guidance.interface import EventKind, GuidanceInput, GuidanceOutpu
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.guidance.objects.tracked_object import Subject
 from companion.recording.encoding import decode, encode
-from companion.settings.reading import ConfigurationError, load_settings
 from tests.companion.guidance.guidance_harness import STEP_S, GuidanceHarness, assert_failed, flying
 from tests.companion.guidance.kinematic_vehicle import SeenObject, look
 from vision.path_planner import PlannedPath
@@ -192,9 +191,3 @@ def test_paths_are_recorded_exactly() -> None:
     flown(harness, 1.0)
     output = next(output for output in harness.outputs if output.path_request is not None)
     assert decode(GuidanceOutput, encode(GuidanceOutput, output)) == output
-
-
-def test_avoid_needs_obstacle_sectors() -> None:
-    flags = {"guidance.avoid": "true", "guidance.obstacles": "off"}
-    with pytest.raises(ConfigurationError, match="avoid"):
-        load_settings("/dev/null", flags, environment={})

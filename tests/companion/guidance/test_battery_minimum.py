@@ -131,9 +131,3 @@ def test_stale_battery_in_flight_is_logged_once() -> None:
     assert not future.done()
     assert len(battery_events(harness)) == 1
     assert "stale" in battery_events(harness)[0]
-
-
-@pytest.mark.parametrize(("fraction", "action"), [(1.5, "rtl"), (-0.1, "rtl"), (0.2, "dive")])
-def test_invalid_minimum_is_rejected(fraction: float, action: str) -> None:
-    with pytest.raises(ValueError, match="must be"):
-        BatteryMinimum(fraction, action)  # type: ignore[arg-type]  # one action is invalid

@@ -1,6 +1,5 @@
 import math
 from dataclasses import replace
-from typing import TypedDict
 
 import pytest
 from hypothesis import given
@@ -269,27 +268,6 @@ def test_position_setpoint_without_position_is_a_brake() -> None:
     sent, reasons = Envelope(LIMITS).apply(Setpoint.position((5, 0, -5), NOW), VehicleState(), NOW, 0.02)
     assert sent.velocity_ned_mps == (0.0, 0.0, 0.0)
     assert reasons == ("position unknown",)
-
-
-class SomeLimits(TypedDict, total=False):
-    max_climb_mps: float
-    max_distance_m: float
-    min_altitude_m: float
-    max_yaw_rate_radps: float
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        {"max_climb_mps": 0.0},
-        {"max_distance_m": math.nan},
-        {"min_altitude_m": 60.0},
-        {"max_yaw_rate_radps": -1},
-    ],
-)
-def test_invalid_limits_are_rejected_by_name(arguments: SomeLimits) -> None:
-    with pytest.raises(ValueError, match=next(iter(arguments))):
-        Limits(**arguments)
 
 
 def test_steep_velocity_keeps_its_direction() -> None:

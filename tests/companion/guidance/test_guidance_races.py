@@ -91,11 +91,6 @@ def test_stop_whose_mode_shows_before_its_answer_ends_command() -> None:
     assert harness.guidance.phase is Phase.IDLE
 
 
-def test_takeoff_request_needs_an_altitude() -> None:
-    with pytest.raises(ValueError, match="altitude"):
-        ModeRequest(FlightMode.TAKEOFF)
-
-
 def test_mode_change_after_a_command_supersedes_it() -> None:
     harness = hovering()
     given = CommandInput(99, "hold", HoldBehaviour(), mode_changes=harness.autopilot.mode_changes)

@@ -24,7 +24,7 @@ from companion.guidance.limits.obstacles import (
 )
 from companion.guidance.requirements import check_requirements
 from companion.service.factory import guidance_options
-from companion.settings.reading import ConfigurationError, load_settings
+from companion.settings.reading import load_settings
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness, known
@@ -150,12 +150,6 @@ def test_obstacle_distance_is_sent_at_10_hz_while_fresh(send: bool) -> None:
             sent.append((vehicle.now_ns - begun_ns) / 1e9)
         vehicle.now_ns += 50_000_000
     assert sent == pytest.approx([number / 10 for number in range(56)] if send else [])
-
-
-def test_sending_needs_obstacle_sectors() -> None:
-    flags = {"guidance.send_obstacle_distance": "true", "guidance.obstacles": "off"}
-    with pytest.raises(ConfigurationError, match="send_obstacle_distance"):
-        load_settings("/dev/null", flags, environment={})
 
 
 def test_missing_required_depth_is_refused() -> None:

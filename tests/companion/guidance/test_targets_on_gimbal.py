@@ -155,13 +155,6 @@ def test_changed_yaw_frame_is_not_interpolated() -> None:
         assert target.bearing_rad == pytest.approx(heading, abs=0.02)
 
 
-def test_gimbal_mount_needs_the_gimbal_attitude() -> None:
-    with pytest.raises(ValueError, match=r"gimbal.* `held`"):
-        MOUNT.ned_from_optical(np.eye(3))
-    with pytest.raises(ValueError, match="body_from_optical"):
-        _ = MOUNT.body_from_optical
-
-
 @pytest.mark.parametrize(("pitch_deg", "down"), [(-90.0, True), (-75.0, True), (-40.0, False), (0.0, False)])
 def test_gimbal_camera_looks_down_with_the_gimbal(pitch_deg: float, down: bool) -> None:
     history = StateHistory()

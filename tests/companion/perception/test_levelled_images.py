@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from companion.bench.lockstep_flight import plain_settings
 from companion.perception.assembly import ATTITUDES_S, CameraTelemetry, build_levelling
-from companion.settings.reading import ConfigurationError
 from vision.attitude import quaternion_from_euler
 from vision.frame import Frame
 
@@ -66,8 +65,3 @@ def test_frame_that_waited_for_the_encoder_is_levelled() -> None:
     stamps = range(CAPTURED_NS - step_ns, CAPTURED_NS + round((ATTITUDES_S - 1.0) * 1e9), step_ns)
     level = build_levelling(plain_settings(), telemetry_of(ROLL_RAD, *stamps))
     assert level(Frame(tilted_line(), CAPTURED_NS, 0), tilted_line()) is not None
-
-
-def test_level_needs_a_video() -> None:
-    with pytest.raises(ConfigurationError, match=r"recording.*level .*set video"):
-        plain_settings({"recording.level": "true"})

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import pytest
-
 from companion.bench.lockstep_flight import plain_settings
 from companion.guidance import Select
-from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.grammar import parse
 from companion.perception.cameras import PerceptionCamera
 from companion.service.command_handler import CommandHandler
@@ -59,26 +56,6 @@ def test_rectangle_of_a_command() -> None:
     assert isinstance(command, Select)
     assert command.request == SelectRequest((0.4, 0.3, 0.1, 0.2), 91_000_000)
     assert Select().request == SelectRequest(None)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("select x=0.4 y=0.3", ["width, height is missing"]),
-        ("select x=0.4 y=0.3 width=0.7 height=0.1", ["1.1", "fractions"]),
-        ("select x=0.4 y=0.3 width=0 height=0.1", ["above 0"]),
-        ("select x=400 y=0.3 width=0.1 height=0.1", ["0 to 1", "400"]),
-    ],
-)
-def test_errors_name_what_to_give(text: str, words: list[str]) -> None:
-    with pytest.raises(GrammarError) as caught:
-        parse(text)
-    assert [word for word in words if word not in str(caught.value)] == []
-
-
-def test_select_is_no_step_of_a_mission() -> None:
-    with pytest.raises(GrammarError, match=r"select: .* step .*mission"):
-        Select().build(NO_CONTEXT)
 
 
 async def test_reply_has_track_and_class_and_nothing_is_flown() -> None:

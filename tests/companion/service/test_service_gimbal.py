@@ -17,7 +17,7 @@ from companion.guidance.interface import StreamStatus
 from companion.perception.assembly import CameraTelemetry, _pose_at, _view_at
 from companion.perception.messages import Attitude, GimbalAttitude
 from companion.service import Service
-from companion.settings.reading import ConfigurationError, load_settings
+from companion.settings.reading import load_settings
 from companion.vehicle.gimbal import GimbalState, YawFrame
 from companion.vehicle.state import VehicleState
 from vision.attitude import quaternion_from_euler
@@ -175,11 +175,6 @@ async def test_gimbal_of_a_camera_is_searched_and_its_loss_reported() -> None:
     service._loop._step(lost_ns)
     assert "direction unknown" in service.events[-1].text
     assert "10.0 s old" in service.events[-1].text
-
-
-def test_stabilized_and_on_gimbal_exclude_each_other() -> None:
-    with pytest.raises(ConfigurationError, match=r"on_gimbal .*stabilized exclude"):
-        service_of(camera__on_gimbal="true", camera__stabilized="true")
 
 
 def test_camera_view_uses_the_gimbals_attitude() -> None:

@@ -328,11 +328,6 @@ def test_settings_are_frozen() -> None:
         Settings().detector.confidence = 0.5
 
 
-def test_copy_with_a_name_that_is_no_setting_is_refused() -> None:
-    with pytest.raises(KeyError, match="realtime"):
-        Settings().source.model_copy(update={"realtime": False})
-
-
 def test_field_of_view_spans_the_frame() -> None:
     model = Settings().camera.model(640, 480)
     assert math.degrees(2 * math.atan(320 / model.fx)) == pytest.approx(80.0)
@@ -486,13 +481,6 @@ def test_recorded_lens_is_read_without_its_file(tmp_path: Path) -> None:
     assert settings.camera.lens == LENS_MODEL
 
 
-def test_renamed_views_section_names_cameras(tmp_path: Path) -> None:
-    path = tmp_path / "companion.toml"
-    path.write_text('[views.down.source]\nuri = "down.mp4"\n')
-    with pytest.raises(ConfigurationError, match=r"\[views\].*renamed .*\[cameras\]"):
-        load_settings(path, {}, {})
-
-
 def test_changed_settings_keep_the_rest() -> None:
     keys = {"guidance.max_climb_mps": "1", "cameras.down.source.uri": "down.mp4"}
     before = load_settings(os.devnull, keys, {})
@@ -501,8 +489,3 @@ def test_changed_settings_keep_the_rest() -> None:
     assert after.cameras == before.cameras != {}
     with pytest.raises(ConfigurationError, match=r"guidance\.brake_s"):
         changed(before, {"guidance.brake_s": "fast"})
-
-
-def test_unit_of_depth_needs_a_depth_source() -> None:
-    with pytest.raises(ConfigurationError, match=r"source: depth_scale"):
-        load_settings(os.devnull, {"source.depth_scale": "0.001"}, environment={})

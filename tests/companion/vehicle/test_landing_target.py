@@ -66,8 +66,3 @@ def test_any_target_is_packed_with_its_position(
     assert ardupilot[8:11] == pytest.approx(offset, rel=1e-5, abs=1e-5)
     assert px4[6] == 255  # the field holds no more
     assert all(math.isfinite(value) for value in (*px4, *ardupilot))
-
-
-def test_non_finite_target_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"be finite, .*nan"):
-        LandingTarget(0, 1, (math.nan, 0.0, 0.0), (0.0, 0.0, 1.0), 0.5)

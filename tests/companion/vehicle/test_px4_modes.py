@@ -45,8 +45,3 @@ def test_position_request_has_sub_mode_zero() -> None:
 def test_any_custom_mode_is_decoded(custom_mode: int) -> None:
     mode = mode_of_custom_mode(custom_mode)
     assert mode is FlightMode.UNKNOWN or custom_mode & 0xFFFF0000 in SHOWN or mode is FlightMode.READY
-
-
-def test_unknown_mode_cannot_be_requested() -> None:
-    with pytest.raises(ValueError, match=r"unknown .*hold"):
-        request_of_mode(FlightMode.UNKNOWN)

@@ -1,51 +1,13 @@
 from __future__ import annotations
 
-import math
-from typing import Any
-
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.setpoint import DEFAULT_LIFETIME_S, Setpoint
 
-POSITION = (1.0, 2.0, -3.0)
 finite = st.floats(-1e6, 1e6)
 vectors = st.tuples(finite, finite, finite)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        pytest.param({}, "exactly one", id="nothing"),
-        pytest.param({"position_ned_m": POSITION, "velocity_ned_mps": POSITION}, "exactly one", id="both"),
-        pytest.param(
-            {"position_ned_m": POSITION, "yaw_rad": 0.0, "yaw_rate_radps": 0.0},
-            "not both",
-            id="yaw and its rate",
-        ),
-        pytest.param(
-            {"position_ned_m": POSITION, "acceleration_ned_mps2": POSITION},
-            "velocity_ned_mps",
-            id="feed-forward of a position",
-        ),
-        pytest.param(
-            {"velocity_ned_mps": POSITION, "acceleration_ned_mps2": (0.0, math.nan, 0.0)},
-            "finite",
-            id="acceleration is not a number",
-        ),
-        pytest.param({"velocity_ned_mps": (math.nan, 0.0, 0.0)}, "finite", id="not a number"),
-        pytest.param({"position_ned_m": (0.0, math.inf, 0.0)}, "finite", id="infinite"),
-        pytest.param({"velocity_ned_mps": POSITION, "yaw_rad": math.nan}, "finite", id="yaw is not a number"),
-        pytest.param(
-            {"velocity_ned_mps": POSITION, "yaw_rate_radps": math.inf}, "finite", id="rate infinite"
-        ),
-    ],
-)
-def test_invalid_setpoint_is_refused(values: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Setpoint(0, **values)
 
 
 # POSITION_TARGET_TYPEMASK, each axis' bit by its name in the specification

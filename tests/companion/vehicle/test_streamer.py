@@ -249,11 +249,6 @@ async def test_missed_ticks_are_skipped() -> None:
     assert gaps == [10 * MS] * 4 + [340 * MS] + [10 * MS] * 15
 
 
-def test_rate_below_px4s_minimum_is_refused() -> None:
-    with pytest.raises(ValueError, match="rate_hz"):
-        Streamer(lambda _: None, rate_hz=2.0)
-
-
 async def test_streamer_runs_in_a_real_loop_until_cancelled() -> None:
     sent, enough = [], asyncio.Event()
 
