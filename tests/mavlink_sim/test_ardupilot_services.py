@@ -181,15 +181,6 @@ def test_missions_are_refused(copter: LockstepVehicle) -> None:
     assert [m.count for m in reported if m.get_type() == "MISSION_COUNT"] == [0]
 
 
-def test_gimbal_and_px4_parameter_refused() -> None:
-    with pytest.raises(ValueError, match="no gimbal"):
-        LockstepVehicle(autopilot="ardupilot", gimbal=True)
-    with pytest.raises(KeyError, match="COM_OF_LOSS_T"):
-        LockstepVehicle(autopilot="ardupilot", parameters={"COM_OF_LOSS_T": 1.0})
-    with pytest.raises(ValueError, match="px4, ardupilot"):
-        LockstepVehicle(autopilot="betaflight")
-
-
 def test_a_whole_flight_by_mavutil(tmp_path: Path) -> None:
     """A flight as in ArduPilot's tutorials: modes by name, arm, take off, go to a point, return."""
     with running_simulator(autopilot="ardupilot", ready_after=0.0, speed=6.0) as simulator:

@@ -166,29 +166,6 @@ def test_non_empty_folder_refused(tmp_path: Path) -> None:
     assert files(tmp_path).keys() == {"mine.txt"}
 
 
-def test_scene_without_viewpoint_refused(tmp_path: Path) -> None:
-    full = World((WorldObject(0, "box", (0.0, 0.0, 0.0), size_m=(400.0, 400.0, 50.0)),))
-    with pytest.raises(DatasetError, match=r"viewpoint between .* m "):
-        make_dataset(tmp_path / "set", Scene(full), DatasetOptions(1, classes=("box",)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"frames": 0}, "1 frame"),
-        ({"classes": ("car", "cat")}, "classes"),
-        ({"classes": ()}, "got none"),
-        ({"validation": 1.0}, "shares of validation"),
-        ({"altitude_m": (5.0, 2.0)}, "altitudes must rise"),
-        ({"size": (8, 8)}, "32 to 4096"),
-        ({"seed": -1}, "seed"),
-    ],
-)
-def test_invalid_options_refused(changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(DatasetError, match=message):
-        DatasetOptions(**{"frames": 1, **changes})
-
-
 SCENE_FILE = """
 [ground]
 tile_texels = 256

@@ -232,31 +232,12 @@ def test_words_in_any_order(
     assert (fault.at_s, fault.duration_s) == (at_s, duration_s)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("", "names no fault"),
-        ("at=3", "names no fault"),
-        ("link_dely 1", "link_delay"),
-        ("link_delay", "link_delay SECONDS"),
-        ("link_delay x", "0 to 60 s"),
-        ("link_delay nan", "expected a number"),
-        ("link_delay 1 2 gcs in 5", "unexpected"),
-        ("link_delay 1 colour=red", "unexpected 'colour='"),
-        ("link_delay 1 way=up", "both, out, in"),
-        ("link_delay 1 at=-1", "expected a number, 0"),
-        ("link_delay 1 for=0", "above 0 s"),
-        ("link_delay 1 for=1 for=2", "for is given twice"),
-        ("motor_failure 5", "1 to 4"),
-        ("battery full", "low, critical, emergency"),
-        ("lost_ack 0", "a whole number, 1 to"),
-        ("gps_loss seed=x", "a whole number"),
-    ],
-)
-def test_invalid_faults_refused_in_one_line(text: str, message: str) -> None:
+@pytest.mark.parametrize("text", ["", "at=3"])
+def test_text_without_a_fault_is_refused_with_the_known_ones(text: str) -> None:
     with pytest.raises(FaultError) as error:
         parse_fault(text, KINDS)
-    assert message in str(error.value)
+    assert str(error.value).startswith(f"'{text}' ")
+    assert ", ".join(KINDS) in str(error.value)
     assert "\n" not in str(error.value)
 
 

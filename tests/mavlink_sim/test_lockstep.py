@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from mavlink_sim import CommandRefusedError, LockstepVehicle, NotReachedError
-from mavlink_sim.faults.grammar import FaultError
 from mavlink_sim.wire.messages import dialect, parser
 from mavlink_sim.wire.signing import Signing
 from mavlink_sim.wire.streams import GCS_RATES_HZ, ONBOARD_RATES_HZ
@@ -236,12 +235,6 @@ def test_a_link_with_a_key_signs_and_refuses_what_is_unsigned() -> None:
     client.set_up(bytes(range(32)), 2_000_000)
     assert vehicle.send_bytes(client.signed(bytes(heartbeat.pack(parser(1, 191))))) == 1
     assert vehicle.vehicle.links["onboard"].received == 1
-
-
-def test_a_vehicle_without_links_refuses_faults_of_links() -> None:
-    vehicle = LockstepVehicle({})
-    with pytest.raises(FaultError, match="no links"):
-        vehicle.vehicle.faults.begin("link_delay 0.2")
 
 
 def client_reads(data: bytes) -> list[Any]:

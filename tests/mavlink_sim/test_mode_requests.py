@@ -2,9 +2,8 @@
 
 import pytest
 
-from mavlink_sim import LockstepVehicle
 from mavlink_sim.px4.modes import Mode, base_mode, mode_of
-from mavlink_sim.releases import RELEASES, release_named
+from mavlink_sim.releases import RELEASES
 from mavlink_sim.wire.messages import dialect
 from tests.mavlink_sim.conftest import SimHarness, velocity_setpoint
 
@@ -220,13 +219,3 @@ def test_reported_version_is_the_releases(release: str) -> None:
     harness.command(512, 148)
     version = harness.received("AUTOPILOT_VERSION")[0].flight_sw_version
     assert f"{version >> 24}.{version >> 16 & 0xFF}" == release
-
-
-def test_unknown_release_refused() -> None:
-    with pytest.raises(ValueError, match=r"'2\.0'.*1\.14, 1\.15, 1\.16, 1\.17"):
-        release_named("2.0")
-
-
-def test_an_ardupilot_vehicle_in_lockstep_has_no_release_of_px4() -> None:
-    with pytest.raises(ValueError, match=r"px4 .1\.14."):
-        LockstepVehicle(autopilot="ardupilot", px4="1.14")

@@ -11,7 +11,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from mavlink_sim.wire import packing
 from mavlink_sim.wire.messages import dialect, parser
-from mavlink_sim.wire.packing import Packed, checksum, packer
+from mavlink_sim.wire.packing import Packed, checksum
 
 HOT = {
     name: getattr(dialect, f"MAVLink_{name}_message")
@@ -97,8 +97,3 @@ def test_a_codec_that_signs_gets_a_signed_packet() -> None:
     assert packet[2] & 1  # MAVLINK_IFLAG_SIGNED
     assert packet[:10] == packet[:1] + bytes([packet[1], 1, 0]) + packet[4:10]
     assert len(packet) == 10 + packet[1] + 2 + 13
-
-
-def test_a_message_with_text_is_refused() -> None:
-    with pytest.raises(ValueError, match="STATUSTEXT"):
-        packer(dialect.MAVLink_statustext_message)

@@ -221,12 +221,6 @@ def test_a_weak_motor_is_flown_with() -> None:
     assert math.dist(airframe.position, (0.0, 0.0, -5.0)) < 0.1
 
 
-@pytest.mark.parametrize(("motor", "share"), [(4, 0.0), (-1, 0.0), (0, 1.5), (0, math.nan)])
-def test_unknown_motor_refused(motor: int, share: float) -> None:
-    with pytest.raises(ValueError, match="motor"):
-        Multirotor().fail_motor(motor, share)
-
-
 @pytest.mark.parametrize(
     ("down_mps", "bounces", "crashes"), [(0.5, False, False), (2.5, True, False), (7.0, True, True)]
 )

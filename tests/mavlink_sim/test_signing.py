@@ -216,14 +216,6 @@ def test_an_endpoint_refuses_and_counts_over_a_real_socket() -> None:
     peer.close()
 
 
-@pytest.mark.parametrize(
-    ("text", "words"), [("00" * 31, "31"), ("nothing", "neither"), ("", "0")], ids=["short", "word", "empty"]
-)
-def test_invalid_key_refused_without_repeating_it(text: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        key_of(text)
-
-
 def test_a_key_comes_as_digits_or_from_a_file(tmp_path: Path) -> None:
     assert key_of(KEY.hex()) == KEY
     (tmp_path / "key").write_bytes(KEY)
