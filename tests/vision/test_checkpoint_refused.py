@@ -252,13 +252,6 @@ def test_a_file_of_another_kind_is_rejected_in_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_rejected_in_one_line(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match=r"no such .*\.pt"):
-        load_checkpoint(tmp_path / "none.pt")
-    with pytest.raises(CheckpointError, match="is a folder"):
-        load_checkpoint(tmp_path)
-
-
 def test_an_archive_without_a_model_is_rejected(tmp_path: Path) -> None:
     for value in ({"weights": 1}, [1, 2], {"model": None}, {"model": torch.zeros(2)}, {"ema": {"a": 1}}, 5):
         torch.save(value, tmp_path / "x.pt")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -53,9 +52,3 @@ def test_every_frame_is_accepted_or_counted_once(rate_hz: float | None, gaps_ms:
     chosen, selector = looked_at(rate_hz, stamps)
     assert len(chosen) + selector.skipped == len(stamps)
     assert chosen[0] == 0
-
-
-@pytest.mark.parametrize("bad", [0.0, -1.0])
-def test_rate_that_is_not_above_zero_is_refused(bad: float) -> None:
-    with pytest.raises(ValueError, match="rate_hz"):
-        FrameSelector(bad)

@@ -113,19 +113,3 @@ def test_a_network_of_larger_strides_is_given_multiples_of_them() -> None:
     assert (box.width, box.height) == (640, 448)
     with pytest.raises(ValueError, match="multiple of 64"):
         fit(640, 480, 96, stride=64)
-
-
-@pytest.mark.parametrize("size", [0, 31, 100, -32])
-def test_an_image_size_that_is_no_multiple_of_32_is_rejected(size: int) -> None:
-    with pytest.raises(ValueError, match="multiple of 32"):
-        fit(640, 480, size)
-
-
-def test_a_frame_of_another_size_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"is for \(480, 640, 3\), got \(10, 10, 3\)"):
-        fit(640, 480).apply(np.zeros((10, 10, 3), np.uint8))
-
-
-def test_a_frame_without_pixels_is_rejected() -> None:
-    with pytest.raises(ValueError, match="got 0x480"):
-        fit(0, 480)

@@ -143,8 +143,3 @@ def test_unknown_attitude_of_a_row_gives_no_poses() -> None:
     known = (AHEAD, np.eye(3))
     assert poses_of_readout(lambda stamp_ns: known if stamp_ns < 10**9 else None, 10**9, 0.02) is None
     assert poses_of_readout(lambda stamp_ns: known, 10**9, 0.0) == [known]
-
-
-def test_image_of_another_size_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"lens .*320x240, .*image .*160x120"):
-        level_image(np.zeros((120, 160), np.uint8), PINHOLE, np.eye(3))

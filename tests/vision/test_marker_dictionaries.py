@@ -50,11 +50,6 @@ def test_wrong_name_lists_the_right_ones(name: str) -> None:
     assert all(each in str(caught.value) for each in DICTIONARIES)
 
 
-def test_family_without_a_length_is_asked_back_for() -> None:
-    with pytest.raises(ValueError, match="5X5_50, 5X5_100, 5X5_250, 5X5_1000"):
-        MarkerKind("DICT_5X5", 0.5)
-
-
 def test_family_on_a_board_is_the_shortest_that_has_its_markers() -> None:
     assert Board("charuco", 10, 7, 0.02, 0.015, "DICT_4X4").dictionary == "4X4_50"
     assert Board("charuco", 14, 9, 0.02, 0.015, "5x5").dictionary == "5X5_100"

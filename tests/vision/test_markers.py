@@ -166,17 +166,6 @@ def test_invalid_corners_have_no_pose(corners: NDArray[Any]) -> None:
     assert marker_from_corners(0, corners, 0.5, PLAIN) is None
 
 
-def test_invalid_settings_are_rejected_by_name() -> None:
-    with pytest.raises(ValueError, match=r"dictionary '4x4' .*4X4_50"):
-        MarkerKind("4x4", 0.5)
-    with pytest.raises(ValueError, match=r"50 .*4X4_50 .*0 to 49"):
-        MarkerKind("4X4_50", 0.5, {50: 0.1})
-    with pytest.raises(ValueError, match="got -1"):
-        MarkerKind("4X4_50", 0.5, {1: -1})
-    with pytest.raises(ValueError, match=r"640x480 .*320x240"):
-        MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(np.zeros((240, 320, 3), np.uint8), PLAIN)
-
-
 def test_marker_survives_pickling() -> None:
     marker = MarkerDetector(MarkerKind("4X4_50", 0.5)).detect(make_image(2.0, 0.0, 0.0), PLAIN)[0]
     data = pickle.dumps(marker)

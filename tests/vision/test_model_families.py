@@ -16,7 +16,7 @@ from torch import Tensor
 
 from tests.vision.dense_decoding import decoded
 from vision.training.published import SCALES, _scale, describe, model_family_of, published_description
-from vision.yolo.architecture import ArchitectureError, ModelDescription, YoloModel, build, build_shapes
+from vision.yolo.architecture import ModelDescription, YoloModel, build, build_shapes
 from vision.yolo.postprocess import select_boxes
 
 COCO_SIZED = [f"class {index}" for index in range(80)]
@@ -192,17 +192,6 @@ def test_published_description_survives_the_round_trip(model_family: str) -> Non
     for scale in SCALES[model_family]:
         description = published_description(model_family, scale, FEW)
         assert ModelDescription.from_plain(description.to_plain()) == description
-
-
-@pytest.mark.parametrize(
-    ("model_family", "scale", "expected"),
-    [("YOLO13", "n", "'YOLO13'.*YOLOv5u, YOLOv8"), ("YOLO11", "b", "YOLO11 .*'b'.*n, s, m, l, x")],
-)
-def test_an_unpublished_network_is_rejected_with_the_known_ones(
-    model_family: str, scale: str, expected: str
-) -> None:
-    with pytest.raises(ArchitectureError, match=expected):
-        published_description(model_family, scale, FEW)
 
 
 # Facts of a network

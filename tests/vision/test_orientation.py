@@ -89,11 +89,6 @@ def test_direction_on_the_body_does_not_change(
     assert (turned.mount.forward_m, turned.mount.right_m, turned.mount.down_m) == (0.1, 0.2, 0.3)
 
 
-def test_unknown_angle_is_refused() -> None:
-    with pytest.raises(ValueError, match="0, 90, 180 or 270, got 45"):
-        SourceSettings(rotate_deg=45)
-
-
 class OneFrame(Capture):
     """A camera that brings its calibration, and delivers one image with depth."""
 

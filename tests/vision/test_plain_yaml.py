@@ -37,27 +37,6 @@ def test_class_names_stay_strings() -> None:
     ]
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        pytest.param("a: 1\nb: !!python/object/apply:os.system [id]", "line 2: the tag", id="a program"),
-        pytest.param("a: &x [1]\nb: *x", "line 1: anchors", id="an alias"),
-        pytest.param("a: 1\na: 2", "duplicate key 'a'", id="a key twice"),
-        pytest.param("? [1, 2]\n: 3", "plain value", id="a list as key"),
-        pytest.param("a: [1, 2", "line [12]: ", id="an open bracket"),
-        pytest.param("a: \x00", "characters", id="a control character"),
-        pytest.param("--- 1\n--- 2\n", "document", id="two documents"),
-        pytest.param("[" * 100 + "]" * 100, "levels deep", id="deep"),
-        pytest.param("[" + "[]," * 200_000 + "]", "more than 100000 values", id="many"),
-        pytest.param(" " * (3 << 20), "characters", id="long"),
-    ],
-)
-def test_anything_else_is_rejected_in_one_line(text: str, expected: str) -> None:
-    with pytest.raises(PlainYamlError, match=expected) as error:
-        load_plain_yaml(text)
-    assert "\n" not in str(error.value)
-
-
 @settings(max_examples=200, deadline=None)
 @given(st.text(alphabet=st.sampled_from("[]{}:,-&*!|>'\"#%@`\n \tab01."), max_size=60) | st.text(max_size=60))
 def test_any_text_is_data_or_a_named_error(text: str) -> None:

@@ -169,12 +169,6 @@ def test_memory_order_of_the_outputs_does_not_matter(order: Literal["C", "F"]) -
     assert again.class_id.tolist() == plain.class_id.tolist()
 
 
-def test_outputs_without_sides_and_neck_are_rejected() -> None:
-    head = Head((8,), 16, False, 1, (0,))
-    with pytest.raises(ValueError, match="the neck"):
-        boxes_of(head, [LevelOutput(classes=np.ones((1, 2, 2), np.float32))])
-
-
 BOXES = st.lists(
     st.tuples(
         st.integers(0, 60),

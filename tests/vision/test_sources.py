@@ -292,22 +292,6 @@ def test_rotated_file_is_delivered_rotated_under_its_name(tmp_path: Path) -> Non
     assert shared == [(2, 3)]
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"width": 0}, "width must be 1..32768"),
-        ({"rate_hz": 0.0}, "rate_hz"),
-        ({"rate_hz": float("nan")}, "rate_hz"),
-        ({"open_timeout_s": 0.0}, "open_timeout_s"),
-        ({"retry_min_s": 5.0, "retry_max_s": 1.0}, "retry_max_s"),
-        ({"pixel_format": "yuv"}, "pixel_format"),
-    ],
-)
-def test_settings_out_of_range_are_named(values: dict[str, object], words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        SourceSettings(**values)  # type: ignore[arg-type]
-
-
 def test_a_real_street_is_read_whole() -> None:
     path = DATA / "video" / "bikes.mp4"
     if not path.exists():

@@ -236,20 +236,3 @@ def test_exposure_and_gain_are_arguments_of_the_program(board: Board) -> None:
 def test_board_without_program_names_the_packages(board: Board) -> None:
     with pytest.raises(SourceError, match=r"rpicam-apps.*gstreamer1\.0-tools, nvidia-l4t-gstreamer"):
         open_source("csi://0")
-
-
-@pytest.mark.parametrize(
-    ("uri", "settings", "message"),
-    [
-        ("csi://front", SourceSettings(), "csi://NUMBER"),
-        ("csi://0", SourceSettings(width=640), "both width and height"),
-        ("csi://0", SourceSettings(width=650, height=480), "multiple of 64"),
-        ("csi://0", SourceSettings(width=640, height=481), "even width and height"),
-        ("csi://0", SourceSettings(pixel_format="YUYV"), "yuv420 or mjpeg"),
-    ],
-)
-def test_settings_that_a_csi_camera_cannot_have_are_refused(
-    uri: str, settings: SourceSettings, message: str
-) -> None:
-    with pytest.raises(SourceError, match=message):
-        open_source(uri, settings)

@@ -131,22 +131,6 @@ def test_plane_layout_matches_opencv() -> None:
     assert float(np.abs(decoded.astype(int) - image).mean()) < 4.0
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        pytest.param(b"YUV4MPEG2 W640 C420", "height", id="no height"),
-        pytest.param(b"YUV4MPEG2 W0 H480", "width", id="no width"),
-        pytest.param(b"YUV4MPEG2 W-4 H480", "width", id="negative"),
-        pytest.param(b"YUV4MPEG2 W99999 H480", "width", id="huge"),
-        pytest.param(b"YUV4MPEG2 W4 H4 C420p10", "ffmpeg -pix_fmt yuv420p", id="ten bits"),
-        pytest.param(b"RIFFxxxx", "YUV4MPEG2 header", id="another format"),
-    ],
-)
-def test_bad_header_is_rejected_with_a_reason(line: bytes, words: str) -> None:
-    with pytest.raises(StreamError, match=words):
-        parse_y4m_header(line)
-
-
 def test_default_colour_space_is_420_and_rate_is_none() -> None:
     header = parse_y4m_header(b"YUV4MPEG2 W6 H5")
     assert header.subsampling == (2, 2)
@@ -158,11 +142,6 @@ def test_a_broken_frame_line_ends_the_stream_with_what_was_there() -> None:
     parser = Y4mParser()
     with pytest.raises(StreamError, match="FRAME"):
         parser.push(b"YUV4MPEG2 W2 H2 Cmono\nFRAME\n\0\0\0\0FRAMEX\n")
-
-
-def test_a_line_without_end_is_rejected() -> None:
-    with pytest.raises(StreamError, match="another format"):
-        Y4mParser().push(b"YUV4MPEG2 " + b"W" * 5000)
 
 
 def test_a_new_writer_on_the_same_pipe_may_change_the_size() -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from vision.file_kinds import open_file
-from vision.text_file import NotUtf8Error, read_text
+from vision.text_file import read_text
 
 ROOT = Path(__file__).parents[2]
 
@@ -19,18 +19,6 @@ ROOT = Path(__file__).parents[2]
 def test_byte_order_mark_is_no_part_of_the_text(tmp_path: Path, encoding: str) -> None:
     (tmp_path / "names.txt").write_text("Fußgänger\n", encoding)
     assert read_text(tmp_path / "names.txt") == "Fußgänger\n"
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [("a".encode("utf-16"), "UTF-16"), (b"\xfe\xff\0a", "UTF-16"), (b"ok\nFu\xdfg", "line 2")],
-)
-def test_another_encoding_is_named(tmp_path: Path, data: bytes, words: str) -> None:
-    (tmp_path / "names.txt").write_bytes(data)
-    with pytest.raises(NotUtf8Error) as caught:
-        read_text(tmp_path / "names.txt")
-    assert words in str(caught.value)
-    assert "save it as UTF-8" in str(caught.value)
 
 
 def test_text_files_are_read_in_one_place() -> None:

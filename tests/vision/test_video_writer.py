@@ -127,26 +127,6 @@ def test_image_may_be_modified_after_write(tmp_path: Path) -> None:
     np.testing.assert_allclose(frames_of(path, 10.0), [40] * 6, atol=4)
 
 
-@pytest.mark.parametrize(
-    ("name", "size", "rate_hz", "words"),
-    [
-        ("video.mp4", (64, 48), 10.0, ".webm"),
-        ("video.webm", (0, 48), 10.0, "1..16383 pixels"),
-        ("video.webm", (64, 48), 0.0, "0.1..240"),
-        ("file/video.webm", (64, 48), 10.0, "cannot be written: "),
-        ("taken.webm", (64, 48), 10.0, "Is a directory"),
-    ],
-)
-def test_write_failure_is_a_one_line_error(
-    tmp_path: Path, name: str, size: tuple[int, int], rate_hz: float, words: str
-) -> None:
-    (tmp_path / "file").write_text("in the way")
-    (tmp_path / "taken.webm").mkdir()
-    with pytest.raises(VideoWriterError, match=re.escape(words)) as caught:
-        VideoWriter(tmp_path / name, *size, rate_hz)
-    assert str(tmp_path / name) in str(caught.value)
-
-
 def test_full_disk_is_reported(tmp_path: Path, encoder: str) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("this system has no /dev/full to stand for a full disk")

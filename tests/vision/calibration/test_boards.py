@@ -103,27 +103,6 @@ def test_fisheye_sees_a_board_beyond_90_degrees() -> None:
     assert np.ptp(image[:, :320]) < 60
 
 
-@pytest.mark.parametrize(
-    ("arguments", "fact"),
-    [
-        (("circles", "10x7", 0.02), "circles"),
-        (("chessboard", "10", 0.02), "'10'"),
-        (("chessboard", "2x7", 0.02), "2x7"),
-        (("chessboard", "10x7", 0.0), "square"),
-        (("chessboard", "10x7", math.nan), "square"),
-        (("chessboard", "10x7", 0.02, 0.015, None), "chessboard has no markers"),
-        (("charuco", "10x7", 0.02), "markers"),
-        (("charuco", "10x7", 0.02, 0.02, "4X4_50"), "0.02"),
-        (("charuco", "10x7", 0.02, 0.015, "4X4_51"), "4X4_51"),
-        (("charuco", "11x10", 0.02, 0.015, "4X4_50"), "55 markers"),
-    ],
-)
-def test_impossible_board_is_refused(arguments: tuple[str, str, float], fact: str) -> None:
-    with pytest.raises(ValueError, match=r"\w") as caught:
-        Board.parse(*arguments)
-    assert fact in str(caught.value)
-
-
 @pytest.mark.parametrize("size", [(10, 8), (7, 10), (5, 6)])
 @pytest.mark.parametrize("kind", [Board, LegacyBoard])
 def test_either_pattern_of_a_charuco_is_found(kind: type[Board], size: tuple[int, int]) -> None:

@@ -146,15 +146,6 @@ def test_the_file_is_a_pdf_whose_table_has_every_object() -> None:
     assert [float(side) * 25.4 / 72.0 for side in box.groups()] == pytest.approx(A4, abs=0.01)
 
 
-def test_a_marker_that_does_not_fit_names_the_paper() -> None:
-    # The usual tag of 160 mm fits on A4.
-    marker_sheets(MarkerKind("APRILTAG_36h11", 0.16), [0], A4)
-    with pytest.raises(ValueError, match=r"0 of 500 mm needs a paper of 635x\d+ mm, got 210x297"):
-        marker_sheets(MarkerKind("APRILTAG_36h11", 0.5), [0], A4)
-    with pytest.raises(ValueError, match="id 50 is not in dictionary 4X4_50"):
-        marker_sheets(MarkerKind("4X4_50", 0.1), [50], A4)
-
-
 def test_papers_are_named_or_bounded_millimetres() -> None:
     assert paper_of("a4") == A4
     assert paper_of("700x1000.5") == (700.0, 1000.5)

@@ -89,8 +89,3 @@ def test_camera_that_looks_straight_down_is_not_upside_down() -> None:
         rotation = matrix_from_euler(found.roll_rad, found.pitch_rad, found.yaw_rad)
         true = matrix_from_euler(0.0, mount.pitch_rad, 0.0)
         assert math.degrees(math.acos(min(1.0, (np.trace(rotation.T @ true) - 1) / 2))) < 0.2
-
-
-def test_no_marker_is_refused() -> None:
-    with pytest.raises(CalibrationError, match="none"):
-        mount_from_markers([])

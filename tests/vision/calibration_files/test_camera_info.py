@@ -144,14 +144,6 @@ def test_addresses_are_compared_by_their_device(
             info.check_source(Orientation(), uri=source)
 
 
-def test_missing_file_and_other_bytes_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"none\.yaml"):
-        read_camera_info(tmp_path / "none.yaml")
-    (file := tmp_path / "image.jpg").write_bytes(b"\xff\xd8\xff\xe0")
-    with pytest.raises(ValueError, match=r"image\.jpg"):
-        read_camera_info(file)
-
-
 def test_lens_that_folds_its_image_is_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     folded = CameraModel(1920, 1080, 800.0, 800.0, 960.0, 540.0, (0.1, -0.2, 0.0, 0.0), "equidistant")
     write_camera_info(file := tmp_path / "folded.yaml", folded, "camera")

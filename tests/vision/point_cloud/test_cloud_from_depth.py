@@ -1,10 +1,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -138,46 +136,6 @@ def test_a_depth_image_without_depth_gives_no_points() -> None:
     assert len(cloud) == 0
     assert cloud.colours is not None
     assert cloud.colours.shape == (0, 3)
-
-
-@pytest.mark.parametrize(
-    ("shape", "options", "key"),
-    [
-        ((30, 41), {}, "(30, 40)"),
-        ((30, 40), {"image": np.zeros((30, 39, 3), np.uint8)}, "(30, 40, 3)"),
-        ((30, 40), {"average": 0}, "average"),
-        ((30, 40), {"average": 31}, "average"),
-        ((30, 40), {"frame": "body"}, "mount"),
-        ((30, 40), {"frame": "ned", "mount": CameraMount()}, "attitude"),
-        ((30, 40), {"frame": "body", "mount": CameraMount(on_gimbal=True)}, "gimbal"),
-    ],
-)
-def test_what_does_not_fit_is_refused(shape: tuple[int, int], options: dict[str, Any], key: str) -> None:
-    with pytest.raises(ValueError, match=key.replace("(", r"\(").replace(")", r"\)")):
-        cloud_from_depth(np.ones(shape, np.float32), SMALL, **options)
-
-
-@pytest.mark.parametrize(
-    ("points", "colours", "frame"),
-    [
-        (np.zeros((4, 2), np.float32), None, "camera"),
-        (np.zeros((4, 3)), None, "camera"),
-        (np.full((4, 3), np.nan, np.float32), None, "camera"),
-        (np.zeros((4, 3), np.float32), np.zeros((3, 3), np.uint8), "camera"),
-        (np.zeros((4, 3), np.float32), None, "map"),
-    ],
-)
-def test_a_cloud_of_other_values_is_refused(points: np.ndarray, colours: np.ndarray, frame: str) -> None:
-    with pytest.raises(ValueError, match=r"points|colours|frame"):
-        PointCloud(points, colours, frame)  # type: ignore[arg-type]
-
-
-def test_frames_do_not_mix() -> None:
-    cloud = PointCloud(np.zeros((1, 3), np.float32), frame="ned")
-    with pytest.raises(ValueError, match="'camera'"):
-        cloud.in_body(CameraMount())
-    with pytest.raises(ValueError, match="'body'"):
-        cloud.in_ned(np.eye(3))
 
 
 @given(seeds, st.integers(0, 20))

@@ -377,11 +377,6 @@ def test_a_precision_that_a_plan_does_not_have_is_rejected(engine: Path) -> None
         TensorRtRuntime(engine, precision="bfloat16")
 
 
-def test_missing_plan_is_a_one_line_error(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeUnusableError, match=r"none\.engine: no .*file"):
-        read_source(tmp_path / "none.engine")
-
-
 class DataType(enum.Enum):
     UINT8 = "tensor(uint8)"
     HALF = "tensor(float16)"

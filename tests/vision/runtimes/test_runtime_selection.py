@@ -52,12 +52,6 @@ def test_missing_runtime_names_its_extra(
         runtime_of_file(runtime, checkpoint)
 
 
-def test_wrong_runtime_name_is_refused_before_the_model_is_read() -> None:
-    wrong: Any = "abacus"
-    with pytest.raises(ValueError, match="runtime must be auto, torch"):
-        Detector("/none.pt", runtime=wrong)
-
-
 def test_missing_runtime_is_not_measured_nor_the_model_read(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -224,20 +224,6 @@ def test_each_stage_has_its_own_decay() -> None:
 
 
 @pytest.mark.parametrize(
-    ("width", "change", "message"),
-    [
-        (64, {"rate": 0.0}, "rate of a stage"),
-        (64, {"decay_steps": -1}, "decay_steps"),
-        (64, {"decay_steps": 101}, "decay_steps"),
-        (100, {}, "multiples of 32 pixels, got 100x64"),
-    ],
-)
-def test_impossible_stage_is_rejected(width: int, change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Stage(width, 64, 1, 100, **change)
-
-
-@pytest.mark.parametrize(
     ("change", "message"),
     [
         pytest.param({"stages": ()}, "one stage", id="no stage"),
