@@ -35,7 +35,7 @@ def test_keys_of_the_file_replace_defaults(file: Path) -> None:
 
 def test_given_setting_that_differs_is_an_error(file: Path) -> None:
     given = ZenohSection(listen=("tcp/127.0.0.1:7447",), config_file=str(file))
-    with pytest.raises(BusError, match=r"zenoh\.listen is .*7447.*listen/endpoints .*7999") as error:
+    with pytest.raises(BusError, match=r"zenoh\.listen .*7447.*endpoints .*7999") as error:
         zenoh_config(given)
     assert str(file) in str(error.value)
     same = ZenohSection(listen=("tcp/127.0.0.1:7999",), config_file=str(file))
@@ -55,6 +55,6 @@ def test_bad_file_is_an_error_that_names_it(tmp_path: Path, text: str | None) ->
     path = tmp_path / "bad.json5"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(BusError, match=r"zenoh\.config_file .*bad\.json5") as error:
+    with pytest.raises(BusError, match=r"config_file .*bad\.") as error:
         zenoh_config(ZenohSection(config_file=str(path)))
     assert "\n" not in str(error.value)

@@ -310,7 +310,7 @@ def test_killed_service_fails_a_pending_command() -> None:
         killer = threading.Thread(target=kill_when_asked)
         with open_client(client_settings(ZenohSection(listen=(endpoint,)))) as session:
             killer.start()
-            with pytest.raises(NoAnswerError, match=r"has gone .*PX4 holds its position.*remote control"):
+            with pytest.raises(NoAnswerError, match=r"'alpha' .*PX4"):
                 send_command(session, "alpha", "orbit", timeout_s=60.0)
         assert time.monotonic() - killed_s < 2.0
         killer.join()
@@ -350,7 +350,7 @@ async def test_silent_service_is_reported_once_and_waited_for(monkeypatch: pytes
     finally:
         await bus.close()
     assert reported.empty()
-    assert "PX4 holds its position" in received[0]
+    assert "PX4" in received[0]
 
 
 def test_connection_to_a_stopped_process_is_closed_quietly(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -371,7 +371,7 @@ async def test_unknown_vehicle_has_no_service() -> None:
         def other_side() -> None:
             with (
                 open_client(client_settings(settings)) as session,
-                pytest.raises(NoAnswerError, match=r"service .* 'beta': .*vehicle\.name"),
+                pytest.raises(NoAnswerError, match=r"'beta': .*vehicle\.name"),
             ):
                 send_command(session, "beta", "hold")
 

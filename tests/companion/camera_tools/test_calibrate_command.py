@@ -141,7 +141,7 @@ def test_calibration_of_turned_images_says_so(few: Path, marker_images: Path, tm
     assert {"rotate_deg: 180", "mirror: true"} <= set(output.read_text().splitlines())
     flags = ("--camera-calibration-file", str(output))
     done = CliRunner().invoke(app, ["describe", "settings", *flags])
-    assert "source.rotate_deg is 0" in one_line_of_bad_input(done)
+    assert "rotate_deg is 0" in one_line_of_bad_input(done)
     turned = ("--source-rotate-deg", "180", "--source-mirror", "true")
     assert CliRunner().invoke(app, ["describe", "settings", *flags, *turned]).exit_code == 0
     done = calibrate("mount", marker_images, "--marker", "7", "--size", "0.6", "--calibration", output)
@@ -230,7 +230,7 @@ def test_live_cameras_are_paired_by_their_stamps() -> None:
     collected = collect_views(colour, BOARD, lambda _: None, 1, Camera([40, 73, 140, 200], board))
     assert (collected.frames, collected.found) == (3, 3)  # 33-40, 66-73, 133-140
     assert len(collected.pairs) == 1  # the board did not move
-    with pytest.raises(CalibrationError, match=r"no board .* of 1 pairs"):
+    with pytest.raises(CalibrationError, match=r"1 pairs"):
         collect_views(Camera([0], board), BOARD, lambda _: None, 1, Camera([10], blank))
     recorded = Camera([0], board)
     recorded.live = False

@@ -19,9 +19,10 @@ def test_cli_checks_a_mission_and_prints_its_plan(exported_model: Path, tmp_path
     done = companion_here("send", "--file", "bad.toml", *options, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.startswith("companion: bad.toml: step 1 (look)")
+    assert done.stderr.startswith("companion: bad.toml: ")
+    assert "step 1" in done.stderr
     assert "'zebra'" in done.stderr
     assert done.stderr.count("\n") == 1
     done = companion_here("send", "--file", "demo", *options, "--detector-runtime", "torch", cwd=tmp_path)
     assert done.returncode == 2
-    assert "cannot run .onnx files" in done.stderr
+    assert ".onnx" in done.stderr

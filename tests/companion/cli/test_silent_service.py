@@ -53,7 +53,5 @@ async def test_command_says_once_that_the_service_is_silent(
         await bus.close()
     assert done.returncode == 0, done.stderr
     assert len(said) == 1
-    assert [line for line in done.stderr.splitlines() if "PX4 holds its position" in line] == [
-        f"companion: {said[0]}"
-    ]
+    assert [line for line in done.stderr.splitlines() if "PX4" in line] == [f"companion: {said[0]}"]
     assert done.stdout.splitlines()[-1] == "done: flown"

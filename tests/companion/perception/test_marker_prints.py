@@ -215,7 +215,7 @@ def test_boards_that_disagree_about_a_print_are_refused(tmp_path: Path) -> None:
         "[[boards.markers]]\nid = 3\nsize_m = 0.5\nposition_m = [0, 0, 0]\n"
     )
     file.write_text(board.format("one", "opencv") + board.format("two", "apriltag"))
-    with pytest.raises(ConfigurationError, match=r"marker 3 .*'opencv'.*'apriltag' .*'two'"):
+    with pytest.raises(ConfigurationError, match=r"3 .*'opencv'.*'apriltag' .*'two'"):
         load_settings(None, {"markers.dictionary": DICTIONARY, "markers.boards_file": str(file)})
 
 

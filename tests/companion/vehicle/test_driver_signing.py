@@ -151,7 +151,7 @@ async def test_signed_link_works_and_wrong_key_is_reported(
     with running_simulator(autopilot=firmware, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
         other = open_driver("pymavlink", url, signing_key=os.urandom(32))
-        with pytest.raises(LinkError, match=r"wrong signature.*same key"):
+        with pytest.raises(LinkError, match=r"signature.*key"):
             await other.connect(2.0)
         driver = open_driver("pymavlink", url, signing_key=KEY)
         await driver.connect(20.0)
