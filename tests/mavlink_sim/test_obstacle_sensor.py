@@ -92,7 +92,7 @@ def test_its_noise_comes_from_the_seed() -> None:
 def test_without_sensor_map_empty_without_scene_refused() -> None:
     vehicle = flying(WALL, obstacle_sensor=False)
     assert set(sensed(vehicle)) == {UNKNOWN_CM}
-    with pytest.raises(ValueError, match=r"obstacle_sensor=True .*scene"):
+    with pytest.raises(ValueError, match=r"sensor=True .*scene"):
         LockstepVehicle(obstacle_sensor=True)
     with pytest.raises(ValueError, match=r"ArduPilot .*--obstacle-sensor"):
         LockstepVehicle(obstacle_sensor=True, scene=World((WALL,)), autopilot="ardupilot")
