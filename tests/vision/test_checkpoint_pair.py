@@ -101,11 +101,11 @@ def test_half_a_pair_names_the_other_half(pair: Path) -> None:
     description = pair.with_suffix(".yaml")
     kept = description.read_text()
     description.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.yaml: .*file; model\.safetensors "):
+    with pytest.raises(CheckpointError, match=r"yaml: .*; model\.safe"):
         load_checkpoint(pair)
     description.write_text(kept)
     pair.unlink()
-    with pytest.raises(CheckpointError, match=r"model\.safetensors: .*file; .*NAME\.safetensors"):
+    with pytest.raises(CheckpointError, match=r"model\.safetensors: .*NAME\."):
         load_checkpoint(description)
 
 

@@ -62,7 +62,7 @@ def test_records_contain_the_track_fields() -> None:
 
 
 def test_track_arrays_are_all_given_or_none() -> None:
-    with pytest.raises(ValueError, match=r"track_id, track_score, track_confirmed .*; track_score is"):
+    with pytest.raises(ValueError, match=r"track_id, .*; track_score"):
         three(track_id=np.array([1, 2, 3]))
 
 

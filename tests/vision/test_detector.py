@@ -166,7 +166,7 @@ def test_nms_threshold_of_a_model_is_used_unless_one_is_given(
 @pytest.mark.parametrize("stated", ["0.5", True, 1.5, float("nan"), [0.5]])
 def test_nms_threshold_of_a_model_is_a_number_from_0_to_1(tmp_path: Path, stated: Any) -> None:
     save_checkpoint(tmp_path / "m.pt", eager_model(), metadata={"nms_iou": stated})
-    with pytest.raises(CheckpointError, match=r"m\.pt: nms_iou .*0\.\.1, got"):
+    with pytest.raises(CheckpointError, match=r"m\.pt: nms_iou .*0\.\.1"):
         detector_of(tmp_path / "m.pt")
 
 

@@ -265,7 +265,7 @@ def test_class_without_a_name_is_refused_and_names_may_be_given(tmp_path: Path) 
     facts = read_source(path).foreign
     assert facts is not None
     assert facts.names_from.startswith("COCO, assumed")
-    with pytest.raises(RuntimeUnusableError, match=r"has class 200, 80 names; write .*NAME\.txt") as caught:
+    with pytest.raises(RuntimeUnusableError, match=r"class 200, 80 .*NAME\.txt") as caught:
         detect(path)
     assert str(caught.value).startswith(f"{path}: ")
     (tmp_path / "a.txt").write_text("\n".join(f"class {number}" for number in range(201)))
@@ -338,16 +338,16 @@ def test_invalid_names_in_metadata_are_refused(tmp_path: Path, names: str, expec
 def test_long_text_in_metadata_is_not_parsed(key: str) -> None:
     metadata = {"names": "['a']", "stride": "32", "args": "{}", key: "[" + "1," * (1 << 15) + "]"}
     ports = [Port("images", (1, 3, 64, 64))], [Port("output0", (1, 5, 84))]
-    with pytest.raises(RuntimeUnusableError, match=r"a\.onnx: has a text of 65538 characters"):
+    with pytest.raises(RuntimeUnusableError, match=r"a\.onnx: .*65538 characters"):
         recognise(Path("a.onnx"), metadata, *ports)
 
 
 def test_unknown_outputs_are_refused_with_their_shapes(tmp_path: Path) -> None:
     outputs = {"out": np.zeros((1, 5, 5), np.float32)}
     path = constant_onnx(tmp_path / "a.onnx", outputs, metadata=stated(TWO, SIZE))
-    with pytest.raises(RuntimeUnusableError, match=r"^\S+: gives out \(1, 5, 5\) float32, .*2 classes"):
+    with pytest.raises(RuntimeUnusableError, match=r"^\S+: .*out \(1, 5, 5\) float32, .*2 classes"):
         read_source(path)
-    with pytest.raises(RuntimeUnusableError, match=r"no metadata .*out \(1, 5, 5\) float32, .*models export"):
+    with pytest.raises(RuntimeUnusableError, match=r"\(1, 5, 5\) float32, .*models export"):
         read_source(constant_onnx(tmp_path / "b.onnx", outputs))
     batch = constant_onnx(tmp_path / "c.onnx", outputs, size=(64, 96), input_type="UINT8")
     with pytest.raises(RuntimeUnusableError, match=r"expected .*\(1, 3, height, width\)"):
@@ -407,7 +407,7 @@ def test_objectness_of_one_everywhere_is_not_yolox(tmp_path: Path) -> None:
     rows = np.zeros((1, 126, 85), np.float32)
     rows[..., 4] = 1
     path = constant_onnx(tmp_path / "a.onnx", {"outputs": rows})
-    with pytest.raises(RuntimeUnusableError, match=r"YOLOX, .*YOLOv6, .*not supported") as caught:
+    with pytest.raises(RuntimeUnusableError, match=r"YOLOX, .*YOLOv6, ") as caught:
         Detector(path, runtime="onnxruntime")
     assert str(caught.value).startswith(f"{path}: ")
 

@@ -270,7 +270,7 @@ def test_video_with_a_name_that_is_not_utf8_is_refused(video: Path, tmp_path: Pa
 @pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
 @pytest.mark.parametrize("key", ["exposure_us", "gain"])
 def test_exposure_of_images_already_taken_is_refused(uri: str, key: str) -> None:
-    with pytest.raises(SourceError, match=rf"source\.{key} .*cameras \(/dev/video0") as error:
+    with pytest.raises(SourceError, match=rf"source\.{key} .*\(/dev/video0") as error:
         open_source(uri, SourceSettings(**{key: 100.0}))  # type: ignore[arg-type]
     assert "secret" not in str(error.value)
 

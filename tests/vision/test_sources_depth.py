@@ -100,7 +100,7 @@ def test_openexr_without_a_depth_channel_is_refused(tmp_path: Path) -> None:
 
 def test_openexr_without_its_extra_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(SourceError, match=r"a\.exr: .*mavlink-companion\[cameras\].*32-bit TIFF"):
+    with pytest.raises(SourceError, match=r"a\.exr: .*\[cameras\].*TIFF"):
         decode_depth(tmp_path / "a.exr", b"")
 
 
@@ -125,7 +125,7 @@ def test_integers_in_metres_are_refused_with_the_key() -> None:
 
 def test_floats_in_millimetres_are_refused_with_the_key() -> None:
     metres = np.full((4, 4), 3.0, np.float32)
-    with pytest.raises(SourceError, match=r"median .*3000 m.*source\.depth_scale"):
+    with pytest.raises(SourceError, match=r" 3000 m.*depth_scale"):
         to_metres(metres * 1000, None)
     np.testing.assert_allclose(to_metres(metres * 1000, 0.001), metres)
     assert np.isnan(to_metres(np.zeros((2, 2), np.float32), None)).all()
@@ -190,10 +190,10 @@ def test_folders_with_other_names_are_paired_by_position(tmp_path: Path) -> None
         depths = [float(frame.depth_m[0, 0]) for frame in source if frame.depth_m is not None]
     assert depths == pytest.approx([1.0, 2.0, 3.0])
     (tmp_path / "depth" / "depth_1.png").unlink()
-    with pytest.raises(SourceError, match=r"^3 images .*colour .* 2 depth images .* 0 is"):
+    with pytest.raises(SourceError, match=r"^3 .* 2 depth .* 0 "):
         open_source(uri, settings)
     saved(tmp_path / "depth" / "depth_0.npy", METRES)
-    with pytest.raises(SourceError, match=r"depth: two .* same name "):
+    with pytest.raises(SourceError, match=r"depth: two "):
         open_source(uri, settings)
 
 
@@ -227,7 +227,7 @@ def test_folders_in_real_time_stay_paired_and_rotated(tmp_path: Path) -> None:
 @pytest.mark.parametrize("realtime", [True, False])
 def test_depth_of_another_size_is_refused(tmp_path: Path, realtime: bool) -> None:
     uri, settings = folders(tmp_path, 2, 2, size=(6, 8))
-    with pytest.raises(SourceError, match="depth is 8x6, the image 16x12"):
+    with pytest.raises(SourceError, match=r"8x6, .*16x12"):
         open_source(uri, SourceSettings(depth=settings.depth, realtime=realtime))
 
 
@@ -247,10 +247,10 @@ def test_depth_of_a_camera_beside_the_colour_one_is_registered(tmp_path: Path) -
         np.testing.assert_allclose(known, index + 1.25, rtol=1e-6)
         assert len(known) > 100
     assert len(frames) == 3
-    with pytest.raises(SourceError, match=r"depth\.yaml .*rotate_deg 0.*rotate_deg is 90"):
+    with pytest.raises(SourceError, match=r"yaml .*rotate_deg 0.* 90"):
         open_source(uri, replace(registered, rotate_deg=90))
     write_camera_info(file, depth.scaled(8, 4), "depth", registration=rig)
-    with pytest.raises(SourceError, match=r"depth: source\.depth_calibration_file: .* 8x4.* 8x6"):
+    with pytest.raises(SourceError, match=r"depth_calibration_file: .* 8x4.* 8x6"):
         open_source(uri, registered)
 
 
@@ -261,17 +261,17 @@ def test_depth_that_cannot_be_paired_is_refused(tmp_path: Path) -> None:
     held = os.open(fifo, os.O_RDWR)
     os.write(held, bytes(16 * 12 * 2))
     try:
-        with pytest.raises(SourceError, match=r"depth\.fifo .*live .*colour .*recording"):
+        with pytest.raises(SourceError, match=r"fifo .*live .*recording"):
             open_source(uri, SourceSettings(depth=str(fifo), width=16, height=12))
         with pytest.raises(SourceError, match=r"gray16 .*width .*height"):
             open_source(uri, SourceSettings(depth=str(fifo)))
     finally:
         os.close(held)
-    with pytest.raises(SourceError, match=r"both source\.uri .* source\.depth"):
+    with pytest.raises(SourceError, match=r"source\.uri .* source\.depth"):
         open_source("-", SourceSettings(depth="-"))
     with pytest.raises(SourceError, match="delivers colour"):
         open_source(uri, SourceSettings(depth="rtsp://camera/1"))
-    with pytest.raises(SourceError, match=r"gray16 is depth: .* source\.depth"):
+    with pytest.raises(SourceError, match=r"gray16 .* source\.depth"):
         open_source(str(fifo), SourceSettings(pixel_format="gray16", width=16, height=12))
     assert settings.depth is not None
 
@@ -436,7 +436,7 @@ def test_error_of_the_depth_source_ends_the_pair(caplog: pytest.LogCaptureFixtur
     caplog.set_level(logging.WARNING)
     colour = ScriptedSource([frame_at(index / 30, index) for index in range(7)], live=True)
     depth = Failing([], live=True, uri="depth.tiff")
-    with pytest.raises(SourceError, match=r"source\.depth depth\.tiff: .*median .* 3000 m"):
+    with pytest.raises(SourceError, match=r"depth\.tiff: .* 3000 m"):
         paired_source(colour, depth, DepthImages(), SourceSettings())
     assert colour.closed
     assert depth.closed

@@ -150,7 +150,7 @@ def test_inverse_distortion_of_a_realsense_is_ignored_once(
 
 def test_missing_depth_camera_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", FakeRealsense())
-    with pytest.raises(SourceError, match=r"realsense://4711: .*No device .*plugged in"):
+    with pytest.raises(SourceError, match=r"realsense://4711: .*No device "):
         open_source("realsense://4711", SourceSettings(open_timeout_s=0.3))
 
 
@@ -275,5 +275,5 @@ def test_oak_delivers_registered_depth_in_metres(platform: str, monkeypatch: pyt
 
 def test_missing_oak_is_a_one_line_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "depthai", FakeOak())
-    with pytest.raises(SourceError, match=r"oak://gone: .*any device .*plugged in"):
+    with pytest.raises(SourceError, match=r"oak://gone: .*device "):
         open_source("oak://gone", SourceSettings(open_timeout_s=0.3))

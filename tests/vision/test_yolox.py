@@ -60,10 +60,10 @@ def test_checkpoint_gives_its_network(tmp_path: Path, width: int, depth: int, de
 
 def test_detector_runs_a_yolox_checkpoint(tmp_path: Path) -> None:
     save_yolox(tmp_path / "x.pth", classes=2)
-    with pytest.raises(CheckpointError, match=r"x\.pth: .*name its 2 classes.*x\.txt"):
+    with pytest.raises(CheckpointError, match=r"x\.pth: .* 2 classes.*x\.txt"):
         Detector(tmp_path / "x.pth")
     (tmp_path / "x.txt").write_text("car\ndog\n")
-    with pytest.raises(RuntimeUnusableError, match=r"onnxruntime .*\.pth files; .*torch"):
+    with pytest.raises(RuntimeUnusableError, match=r"onnxruntime .*\.pth .*torch"):
         Detector(tmp_path / "x.pth", runtime="onnxruntime")
     detector = Detector(tmp_path / "x.pth", confidence=0.01, image_size=96)
     found = detector.detect(make_image(60, 96))
@@ -123,7 +123,7 @@ def test_code_in_a_yolox_checkpoint_is_not_run(tmp_path: Path) -> None:
 def test_another_checkpoint_named_pth_is_read_as_such(tmp_path: Path) -> None:
     torch.save({"model": {"a": torch.zeros(1)}}, tmp_path / "x.pth")
     assert load_yolox(tmp_path / "x.pth") is None
-    with pytest.raises(CheckpointError, match=r"x\.pth: .*no model: .*'ema'"):
+    with pytest.raises(CheckpointError, match=r"x\.pth: .*'ema'"):
         Detector(tmp_path / "x.pth")
 
 

@@ -80,9 +80,9 @@ def test_a_published_apriltag_is_opencv_turned_by_180(dictionary: str) -> None:
 def test_every_dictionary_of_apriltag_is_compared() -> None:
     families = [name for name in DICTIONARIES if is_apriltag(name)]
     assert families == sorted(PUBLISHED)
-    with pytest.raises(ValueError, match="'apriltag' is for AprilTag"):
+    with pytest.raises(ValueError, match=r"'apriltag' .*4X4_50"):
         MarkerKind("4X4_50", 0.5, print="apriltag")
-    with pytest.raises(ValueError, match="opencv, apriltag, got 'other'"):
+    with pytest.raises(ValueError, match=r"opencv, apriltag,.* 'other'"):
         MarkerKind("APRILTAG_36h11", 0.5, prints={3: "other"})
     with pytest.raises(ValueError, match="marker id 587"):
         MarkerKind("APRILTAG_36h11", 0.5, prints={587: "apriltag"})

@@ -138,7 +138,7 @@ def test_missing_default_runtime_is_named_and_not_replaced(
     for read in (Detector, class_names_of):
         with pytest.raises(RuntimeMissingError, match=r"pip install onnxruntime\b") as caught:
             read(path)
-        assert ("use the runtime openvino" in str(caught.value)) is bool(others)
+        assert ("runtime openvino" in str(caught.value)) is bool(others)
 
 
 @pytest.mark.parametrize(("kind", "runtime"), [("onnx", "torch"), ("openvino", "onnxruntime")])
@@ -307,7 +307,7 @@ def test_anything_else_is_rejected_by_name(text: str) -> None:
 )
 def test_invalid_facts_are_rejected(change: dict[str, object]) -> None:
     text = json.dumps(json.loads(FACTS.to_json()) | change)
-    with pytest.raises(RuntimeUnusableError, match=r"^net\.engine: .* metadata .* \(.*models export`"):
+    with pytest.raises(RuntimeUnusableError, match=r"^net\.engine: .* \(.*export`"):
         ExportedFacts.from_json(text, PATH)
 
 
@@ -525,5 +525,5 @@ def test_plan_with_outputs_in_half_is_refused(
     output.name, output.type.tensor_type.elem_type = "half", onnx.TensorProto.FLOAT16
     path = tmp_path / "net.engine"
     path.write_bytes(with_facts(FACTS, model.SerializeToString()))
-    with pytest.raises(RuntimeUnusableError, match=r"net\.engine: half .*HALF.* expected .*FLOAT"):
+    with pytest.raises(RuntimeUnusableError, match=r"half .*HALF.*FLOAT"):
         TensorRtRuntime(path)

@@ -104,7 +104,7 @@ def test_evaluation_of_int8_file_needs_no_precision(
 def test_too_few_calibration_images_are_refused(tmp_path: Path, photographs: Path, count: int) -> None:
     for file in sorted(photographs.iterdir())[:count]:
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    with pytest.raises(RuntimeUnusableError, match=rf"has {count} images.*at least 16"):
+    with pytest.raises(RuntimeUnusableError, match=rf" {count} images.* 16"):
         calibration_images(tmp_path, SIDE, 32)
 
 
@@ -122,7 +122,7 @@ def test_int8_that_differs_too_much_is_not_kept(
         shutil.copy(quantised[0], path)
 
     monkeypatch.setattr(export_module, "_write_int8", write)
-    with pytest.raises(RuntimeUnusableError, match=r"quantised: .* differ by \d\.\d+ .*most 0\.0 "):
+    with pytest.raises(RuntimeUnusableError, match=r"quantised: .* \d\.\d+ .* 0\.0 "):
         export(checkpoint, "onnx", tmp_path / "net.onnx", SIDE, calibrate=photographs)
     assert not list(tmp_path.iterdir())
 

@@ -313,7 +313,7 @@ def test_ranges_stay_with_their_detections() -> None:
 def test_ids_start_at_first_track_id() -> None:
     tracker = Tracker(first_track_id=40)
     assert ids(tracker.update(detections((100, 100, 0.8)), 1)) == [40]
-    with pytest.raises(ValueError, match=r"first_track_id .*got 0"):
+    with pytest.raises(ValueError, match=r"first_track_id .* 0"):
         Tracker(first_track_id=0)
 
 
