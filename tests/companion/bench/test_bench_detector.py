@@ -94,7 +94,7 @@ def test_exported_file_is_measured_on_the_runtimes_that_run_it(
     ("arguments", "expected"),
     [
         (["--model", "none.pt"], "none.pt"),
-        (["--runtime", "abacus"], "runtime must be auto, torch"),
+        (["--runtime", "abacus"], "'abacus'"),
         (["--frame", "big"], "WIDTHxHEIGHT"),
         (["--classes", "zebra"], "unknown class 'zebra'"),
     ],

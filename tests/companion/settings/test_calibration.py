@@ -171,8 +171,8 @@ def test_printed_settings_name_the_calibration_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "facts"),
     [
-        ({}, ("rotate_deg 180", "source.rotate_deg is 0")),
-        ({"rotate_deg": "180"}, ("mirror true", "source.mirror is false")),
+        ({}, ("rotate_deg 180", "source.rotate_deg", " 0")),
+        ({"rotate_deg": "180"}, ("mirror true", "source.mirror", " false")),
         ({"rotate_deg": "180", "mirror": "true", "name": "rear"}, ("'front'", "'rear'", "another camera")),
     ],
 )

@@ -116,42 +116,43 @@ def test_lists_booleans_and_unset_values_are_read_from_text() -> None:
 
 
 @pytest.mark.parametrize(
-    ("key", "text", "expected"),
+    ("key", "text", "words"),
     [
-        ("detector.confidence", "1.7", "must be a number, 0 to 1, got 1.7"),
-        ("detector.confidence", "nan", "must be a number, 0 to 1, got nan"),
-        ("detector.confidence", "high", "must be a number, 0 to 1, got 'high'"),
-        ("detector.image_size", "330", "must be a whole number, 32 to 4096, a multiple of 32, got 330"),
-        ("detector.image_size", "64.5", "must be a whole number, 32 to 4096, a multiple of 32, got '64.5'"),
-        ("tracker.coast_timeout_s", "0", "must be a number, above 0, at most 60, got 0.0"),
-        ("detector.precision", "int8", 'must be auto, float32, bfloat16 or float16, got "int8"'),
-        ("source.loop", "maybe", "must be true or false, got 'maybe'"),
-        ("source.uri", "", 'must be a text, not empty, got ""'),
-        ("source.width", "3", "must be a whole number, 16 to 16384, or unset, got 3"),
-        ("guidance.max_horizontal_speed_mps", "0", "must be a number, above 0, at most 30, got 0.0"),
-        ("camera.horizontal_fov_deg", "180", "must be a number, above 1, below 179, got 180.0"),
-        ("vehicle.name", "a/*", 'must be a word of letters, digits, `_`, `-` and `.`, got "a/*"'),
+        ("detector.confidence", "1.7", ["0 to 1", "got 1.7"]),
+        ("detector.confidence", "nan", ["0 to 1", "got nan"]),
+        ("detector.confidence", "high", ["0 to 1", "got 'high'"]),
+        ("detector.image_size", "330", ["whole number", "32 to 4096", "multiple of 32", "got 330"]),
+        ("detector.image_size", "64.5", ["whole number", "32 to 4096", "got '64.5'"]),
+        ("tracker.coast_timeout_s", "0", ["above 0", "at most 60", "got 0.0"]),
+        ("detector.precision", "int8", ["auto, float32, bfloat16 or float16", 'got "int8"']),
+        ("source.loop", "maybe", ["true or false", "got 'maybe'"]),
+        ("source.uri", "", ["not empty", 'got ""']),
+        ("source.width", "3", ["16 to 16384", "unset", "got 3"]),
+        ("guidance.max_horizontal_speed_mps", "0", ["above 0", "at most 30", "got 0.0"]),
+        ("camera.horizontal_fov_deg", "180", ["above 1", "below 179", "got 180.0"]),
+        ("vehicle.name", "a/*", ["`_`, `-` and `.`", 'got "a/*"']),
         (
             "vehicle.url",
             "/dev/ttyS0",
-            "must be udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial://DEVICE:BAUD or none, "
-            'got "/dev/ttyS0"',
+            ["udpin://HOST:PORT, udpout://HOST:PORT", "serial://DEVICE:BAUD or none", 'got "/dev/ttyS0"'],
         ),
         (
             "detector.class_heights_m",
             "person=1.7",
-            'must be a list of texts, each CLASS:METRES such as person:1.7, got ["person=1.7"]',
+            ["CLASS:METRES", "person:1.7", 'got ["person=1.7"]'],
         ),
         (
             "zenoh.listen",
             "localhost,7447",
-            "must be a list of texts, each a zenoh endpoint such as tcp/192.168.1.5:7447, "
-            'got ["localhost", "7447"]',
+            ["zenoh endpoint", "tcp/192.168.1.5:7447", 'got ["localhost", "7447"]'],
         ),
     ],
 )
-def test_bad_value_has_key_range_and_value(key: str, text: str, expected: str) -> None:
-    assert problems(overrides={key: text}) == [f"{key}: {expected} (given as a flag)"]
+def test_bad_value_has_key_range_and_value(key: str, text: str, words: list[str]) -> None:
+    (line,) = problems(overrides={key: text})
+    assert line.startswith(f"{key}: ")
+    assert line.endswith(f"{words[-1]} (given as a flag)")
+    assert [word for word in words if word not in line] == []
 
 
 def test_class_heights_are_metres_by_class() -> None:
@@ -167,29 +168,32 @@ def test_class_heights_are_metres_by_class() -> None:
 
 
 @pytest.mark.parametrize(
-    ("toml", "expected"),
+    ("toml", "key", "words"),
     [
-        ("[detector]\nconfidence = '0.5'", 'detector.confidence: must be a number, 0 to 1, got "0.5"'),
-        ("[detector]\nconfidence = true", "detector.confidence: must be a number, 0 to 1, got true"),
-        ("[detector]\nenabled = 1", "detector.enabled: must be true or false, got 1"),
+        ("[detector]\nconfidence = '0.5'", "detector.confidence: ", 'a number, 0 to 1, got "0.5"'),
+        ("[detector]\nconfidence = true", "detector.confidence: ", "0 to 1, got true"),
+        ("[detector]\nenabled = 1", "detector.enabled: ", "true or false, got 1"),
         (
             "[detector]\nclasses = 'car'",
-            'detector.classes: must be a list of texts, got "car"',
+            "detector.classes: ",
+            'list of texts, got "car"',
         ),
-        ("[detector]\nclasses = [1.5]", "detector.classes: must be a list of texts, got [1.5]"),
+        ("[detector]\nclasses = [1.5]", "detector.classes: ", "list of texts, got [1.5]"),
         (
             "[vehicle]\nsystem_id = {a = 1}",
-            "vehicle.system_id: must be a whole number, 1 to 255, got {'a': 1}",
+            "vehicle.system_id: ",
+            "1 to 255, got {'a': 1}",
         ),
-        ("detector = 3", "detector: must be a section [detector], got 3"),
-        ("[detector]\nconfidense = 1", "unknown key detector.confidense"),
-        ("[detecter]\nconfidence = 1", "unknown section [detecter]"),
+        ("detector = 3", "detector: ", "section [detector], got 3"),
+        ("[detector]\nconfidense = 1", "unknown key ", "detector.confidense"),
+        ("[detecter]\nconfidence = 1", "unknown section ", "[detecter]"),
     ],
 )
-def test_error_in_a_file_names_key_and_file(tmp_path: Path, toml: str, expected: str) -> None:
+def test_error_in_a_file_names_key_and_file(tmp_path: Path, toml: str, key: str, words: str) -> None:
     path = written(tmp_path / "c.toml", toml)
     (line,) = problems(path)
-    assert line.startswith(expected)
+    assert line.startswith(key)
+    assert words in line
     assert f"(in {path})" in line
 
 
@@ -222,22 +226,23 @@ def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("overrides", "line"),
+    ("overrides", "words"),
     [
         (
             {"guidance.min_altitude_m": "60"},
-            "guidance: min_altitude_m must be below max_altitude_m, got 60 and 50",
+            ["guidance: min_altitude_m ", " max_altitude_m", "60 and 50"],
         ),
-        ({"guidance.setpoint_lifetime_s": "0.04"}, "guidance: setpoint_lifetime_s must be longer than"),
-        ({"camera.on_gimbal": "yes", "camera.stabilized": "yes"}, "camera: on_gimbal and stabilized"),
-        ({"source.pixel_format": "bgr"}, "source: pixel_format"),
-        ({"recording.video": "a.mp4"}, "recording: video must end in .webm, got 'a.mp4'"),
-        ({"zenoh.mode": "client"}, "zenoh: a client needs an endpoint in connect"),
+        ({"guidance.setpoint_lifetime_s": "0.04"}, ["guidance: setpoint_lifetime_s "]),
+        ({"camera.on_gimbal": "yes", "camera.stabilized": "yes"}, ["camera: on_gimbal and stabilized"]),
+        ({"source.pixel_format": "bgr"}, ["source: pixel_format"]),
+        ({"recording.video": "a.mp4"}, ["recording: video ", ".webm", "got 'a.mp4'"]),
+        ({"zenoh.mode": "client"}, ["zenoh: ", " connect"]),
     ],
 )
-def test_contradicting_keys_are_reported(overrides: dict[str, str], line: str) -> None:
+def test_contradicting_keys_are_reported(overrides: dict[str, str], words: list[str]) -> None:
     (problem,) = problems(overrides=overrides)
-    assert problem.startswith(line)
+    assert problem.startswith(words[0])
+    assert [word for word in words if word not in problem] == []
     assert problem.endswith("(given as a flag)")
 
 

@@ -226,7 +226,7 @@ async def test_serial_hangup_is_logged(caplog: pytest.LogCaptureFixture) -> None
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("serial:///dev/no-such-device:57600", "no device /dev/no-such-device"),
+        ("serial:///dev/no-such-device:57600", " device /dev/no-such-device"),
         ("serial:///dev/null:57600", "not a serial device"),
         ("udpin://192.0.2.1:14540", r"no interface .*192\.0\.2\.1"),
         ("udpin://host.invalid:14540", "resolved"),
