@@ -370,9 +370,9 @@ def denied_for(name: str, read: Callable[..., Any]) -> Callable[..., Any]:
     [
         (b"caf\xe9\nb\n", "is not UTF-8"),
         (b"\x1b[31mred\nb\n", "is not printable"),
-        (b"a\n", "has 1 names, rel.onnx has 2 classes"),
+        (b"a\n", "1 names, .* 2 classes"),
         (b"a\n" * (1 << 20), "the limit is"),
-        (None, r"cannot be read \(Permission denied\)"),
+        (None, r"\(Permission denied\)"),
     ],
 )
 def test_unusable_names_beside_are_refused_with_their_file(

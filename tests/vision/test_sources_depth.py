@@ -134,8 +134,8 @@ def test_floats_in_millimetres_are_refused_with_the_key() -> None:
 @pytest.mark.parametrize(
     ("image", "words"),
     [
-        (np.zeros((4, 4), np.uint8), r"16-bit integers or floats, got shape \(4, 4\) uint8"),
-        (np.zeros((4, 4, 3), np.uint16), r"one channel.*got shape \(4, 4, 3\)"),
+        (np.zeros((4, 4), np.uint8), r"16-bit .*\(4, 4\) uint8"),
+        (np.zeros((4, 4, 3), np.uint16), r"one channel.*\(4, 4, 3\)"),
     ],
 )
 def test_image_that_is_not_depth_is_refused(tmp_path: Path, image: NDArray[Any], words: str) -> None:

@@ -250,11 +250,11 @@ def test_exposure_is_set_after_the_automatic_is_off(dev: Path) -> None:
 @pytest.mark.parametrize(
     ("controls", "exposure_us", "gain", "message"),
     [
-        (WEBCAM, 100.0, None, r"source.exposure_us is 100; this camera has 300 to 204700"),
-        (WEBCAM, None, 101.0, r"source.gain is 101; this camera has 0 to 100"),
-        ({}, 8000.0, None, r"no control for source.exposure_us"),
-        ({GAIN: (0, 100, 4)}, None, 5.0, r"no control for source.gain"),
-        ({GAIN: (0, 100, 0x10)}, None, 5.0, r"refuses source.gain 5: Permission denied"),
+        (WEBCAM, 100.0, None, r"source\.exposure_us .*100; .* 300 to 204700"),
+        (WEBCAM, None, 101.0, r"source\.gain .*101; .* 0 to 100"),
+        ({}, 8000.0, None, r"control for source\.exposure_us"),
+        ({GAIN: (0, 100, 4)}, None, 5.0, r"control for source\.gain"),
+        ({GAIN: (0, 100, 0x10)}, None, 5.0, r"source\.gain 5: Permission denied"),
     ],
 )
 def test_control_that_a_camera_cannot_set_is_refused(

@@ -60,34 +60,30 @@ def test_a_channel_count_that_is_declared_unscaled_stays() -> None:
     ("position", "row", "expected"),
     [
         pytest.param(3, [-1, 1, "Quantum", [64]], r"row 3: .*'Quantum'", id="layer"),
-        pytest.param(2, [-1, 1, "C2f", ["wide"]], r"row 2 \(C2f\): channels .* got 'wide'", id="channels"),
+        pytest.param(2, [-1, 1, "C2f", ["wide"]], r"row 2 \(C2f\): channels .*'wide'", id="channels"),
         pytest.param(2, [-1, 1, "C2f", [64, 3]], r"row 2 \(C2f\): the shortcut", id="shortcut"),
         pytest.param(2, [-1, 64, "C2f", [64]], r"", id="many repeats are cut by the depth multiple"),
         pytest.param(2, [-1, 10**9, "C2f", [64]], r"row 2: repeats", id="endless repeats"),
         pytest.param(1, [7, 1, "Conv", [64, 3, 2]], r"row 1 \(Conv\) reads \(7,\)", id="reads ahead"),
         pytest.param(1, ["x", 1, "Conv", [64]], r"row 1: 'from'", id="from"),
         pytest.param(1, [-1, 1, "Conv"], r"row 1 must be", id="short row"),
-        pytest.param(1, [-1, 1, "Conv", [64, 2, 2]], r"row 1 \(Conv\): the kernel must be odd", id="even"),
-        pytest.param(
-            10, [-1, 1, "C2f", [64]], r"row 11 \(Concat\) joins inputs of different sizes", id="not enlarged"
-        ),
+        pytest.param(1, [-1, 1, "Conv", [64, 2, 2]], r"row 1 \(Conv\): the kernel", id="even"),
+        pytest.param(10, [-1, 1, "C2f", [64]], r"row 11 \(Concat\) .*sizes", id="not enlarged"),
         pytest.param(
             21,
             [[18, 15, 12], 1, "Detect", ["nc"]],
-            r"row 21: Detect must read inputs each smaller",
+            r"row 21: Detect .*smaller",
             id="order",
         ),
         pytest.param(1, [-1, 1, "Conv", [64, 3, 2, 3]], r"its stride", id="padding"),
-        pytest.param(1, [-1, 1, "C3k2", [64, 1]], r"row 1 \(C3k2\): the choice of C3k", id="C3k"),
-        pytest.param(1, [-1, 1, "C3k2", [64, False, 0]], r"expansion must be a number in", id="ratio"),
-        pytest.param(1, [-1, 1, "C3k2", [64, False, 0.5, False, 2]], r"does not support groups", id="groups"),
+        pytest.param(1, [-1, 1, "C3k2", [64, 1]], r"row 1 \(C3k2\): .* C3k\b", id="C3k"),
+        pytest.param(1, [-1, 1, "C3k2", [64, False, 0]], r"expansion ", id="ratio"),
+        pytest.param(1, [-1, 1, "C3k2", [64, False, 0.5, False, 2]], r" groups", id="groups"),
         pytest.param(1, [-1, 1, "A2C2f", [8]], r"multiples of 32.* got 4", id="area heads"),
         pytest.param(12, [-1, 1, "C2PSA", [64]], r"16, got 8", id="attended"),
         pytest.param(2, [-1, 1, "PSA", [64, 1]], r"takes at most 1", id="PSA"),
         pytest.param(1, [-1, 1, "Detect", ["nc"]], r"row 1 is 'Detect'", id="early head"),
-        pytest.param(
-            9, [-1, 1, "SPPF", [64, 5, 1, 1, 1, 1]], r"row 9 \(SPPF\): takes at most 5", id="arguments"
-        ),
+        pytest.param(9, [-1, 1, "SPPF", [64, 5, 1, 1, 1, 1]], r"row 9 \(SPPF\): .* most 5", id="arguments"),
     ],
 )
 def test_a_row_that_cannot_be_built_is_named(position: int, row: list[Any], expected: str) -> None:
