@@ -1,6 +1,7 @@
 """Bad input that one call refuses: the type of its error, and the names and values that its message holds."""
 
 import importlib
+import json
 import math
 import os
 from collections.abc import Callable
@@ -24,8 +25,13 @@ from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
 from companion.guidance.missions.mission_file import MissionError, read_mission
 from companion.guidance.objects.from_detections import HistoryError, StateHistory
+from companion.host.peer_data import PeerDataError
+from companion.language.clauses import UnclearError
+from companion.language.sentences import understand
+from companion.language.tools import ToolCall, read_call
 from companion.recording import RecordingError
 from companion.recording.files import RecordingReader
+from companion.settings.calibration import adopt_calibration
 from companion.settings.reading import ConfigurationError, Settings, load_settings
 from companion.vehicle.driver import LinkError
 from companion.vehicle.drivers import open_driver
@@ -33,15 +39,16 @@ from companion.vehicle.gimbal import GimbalAim
 from companion.vehicle.landing_target import LandingTarget
 from companion.vehicle.link_url import LinkUrlError, parse_link_url
 from companion.vehicle.px4_modes import request_of_mode
+from companion.vehicle.report_reader import LARGEST_UNPACKED, EventCatalogue
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, VehicleState, with_fields
 from companion.vehicle.streamer import Streamer
 from mavlink_sim import LockstepVehicle
 from mavlink_sim.camera.depth_camera import DepthSensor
-from mavlink_sim.camera.lens import Shutter
+from mavlink_sim.camera.lens import Lens, Shutter
 from mavlink_sim.camera.scene import CameraSettings, Scene
 from mavlink_sim.camera.scene import Path as ObjectPath
-from mavlink_sim.camera.scene_file import SceneError, parse_scene
+from mavlink_sim.camera.scene_file import SceneError, load_scene, parse_scene
 from mavlink_sim.camera.video_outputs import check_output
 from mavlink_sim.datasets import dataset
 from mavlink_sim.datasets.dataset import DatasetOptions, make_dataset
@@ -56,14 +63,17 @@ from mavlink_sim.wire.signing import key_of
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.shapes import shape_of
 from mavlink_sim.world.world import World, WorldObject
+from tests.companion.language.sentence_table import CLASSES, SCENE
 from tools.compile_simulator import compile_simulator
 from tools.recorded_flight import read_flight
+from vision.annotate import annotate
 from vision.calibration.boards import Board
 from vision.calibration.calibrate import CalibrationError
 from vision.calibration.marker_sheets import marker_sheets
 from vision.calibration.mount import mount_from_markers
-from vision.calibration_files.camera_info import read_camera_info
-from vision.camera_model import CameraModel, CameraMount
+from vision.calibration_files.camera_info import read_camera_info, write_camera_info
+from vision.camera_model import CameraCalibration, CameraModel, CameraMount
+from vision.detections import Detections
 from vision.detector import Detector
 from vision.evaluation import datasets
 from vision.evaluation.metrics import average_precision
@@ -80,6 +90,7 @@ from vision.point_cloud import (
     cloud_from_depth,
     read_cloud,
     voxel_grid,
+    write_cloud,
 )
 from vision.recording import Recording
 from vision.runtimes.base import RuntimeUnusableError
@@ -211,7 +222,74 @@ SERVICE = [
     ),
 ]
 
+
+def fence(key: str, corners: str, *words: str) -> Row:
+    text = f'[guidance]\n{key} = "{corners}"\n'.encode()
+    return row(
+        f"{key} {corners}",
+        lambda folder: load_settings(file(folder, "c.toml", text), {}, {}),
+        ConfigurationError,
+        key,
+        "c.toml",
+        *words,
+    )
+
+
+def lens_file(folder: Path) -> str:
+    model = CameraModel.from_horizontal_fov(640, 480, math.radians(70.0))
+    write_camera_info(path := folder / "camera.yaml", model, "front")
+    return str(path)
+
+
+def calibration(
+    numbers: tuple[float, float, float, float], mount: dict[str, Any], key: str, value: str
+) -> Row:
+    made = CameraCalibration(CameraModel(640, 480, *numbers), CameraMount(**mount))
+    camera = load_settings(os.devnull, {}, environment={}).camera
+    return row(f"calibration's {key}", lambda _: adopt_calibration(camera, made), ValueError, key, value)
+
+
+USUAL = (450.0, 450.0, 320.0, 240.0)
+
 SETTINGS = [
+    fence("fence_include", "0,0 1,1", "3 corners"),
+    fence("fence_exclude", "0,0 1,1", "3 corners"),
+    fence("fence_include", "0,0 10,10 10,0 0,10", "cross"),
+    fence("fence_exclude", "0,0 10,10 10,0 0,10", "cross"),
+    fence("fence_include", "0,0 0,0 10,0", "cross"),
+    fence("fence_exclude", "0,0 0,0 10,0", "cross"),
+    fence("fence_include", "0,0 10,0,5 10,10", "north,east"),
+    fence("fence_exclude", "0,0 10,0,5 10,10", "north,east"),
+    fence("fence_include", "0,0 10,x 10,10", "'10,x'"),
+    fence("fence_exclude", "0,0 10,x 10,10", "'10,x'"),
+    calibration((1e-3, 450.0, 320.0, 240.0), {}, "fx", "0.001"),
+    calibration((450.0, 1e9, 320.0, 240.0), {}, "fy", "1"),
+    calibration((450.0, 450.0, 1e12, 240.0), {}, "cx", "1"),
+    calibration((450.0, 450.0, 320.0, -1e6), {}, "cy", "-1"),
+    calibration(USUAL, {"down_m": 1e30}, "mount_down_m", "1e+30"),
+    calibration(USUAL, {"forward_m": math.nan}, "mount_forward_m", "nan"),
+    calibration(USUAL, {"pitch_rad": 7.0}, "mount_pitch_deg", "401"),
+    row(
+        "calibration_file missing",
+        lambda f: settings({"camera.calibration_file": str(f / "none.yaml")}),
+        ConfigurationError,
+        "camera: ",
+        "none.yaml",
+    ),
+    row(
+        "lens given twice",
+        lambda f: settings({"camera.calibration_file": lens_file(f), "camera.horizontal_fov_deg": "90"}),
+        ConfigurationError,
+        "camera: calibration_file",
+        "horizontal_fov_deg",
+    ),
+    row(
+        "frames of another aspect",
+        lambda f: settings({"camera.calibration_file": lens_file(f)}).camera.model(1280, 720),
+        ValueError,
+        "640x480",
+        "1280x720",
+    ),
     row(
         "avoid without obstacles",
         lambda _: settings({"guidance.avoid": "true", "guidance.obstacles": "off"}),
@@ -363,6 +441,62 @@ GUIDANCE = [
     ),
 ]
 
+
+def call(name: Any, arguments: Any, *words: str) -> Row:
+    tool = ToolCall(name, arguments)
+    return row(f"call {name} {arguments}", lambda _: read_call(tool, CLASSES), ValueError, *words)
+
+
+LANGUAGE = [
+    call("explode", {}, "command 'explode'", "takeoff, land"),
+    call("take off", {}, "command 'take off'", "takeoff?"),
+    call("", {}, "command ''", "takeoff, land"),
+    call("takeoff", "5", "takeoff: ", "object", "'5'"),
+    call("takeoff", "altitude=5", "takeoff: ", "object", "'altitude=5'"),
+    call("takeoff", '[{"altitude": 5}]', "takeoff: ", "object", '[{"altitude": 5}]'),
+    call("takeoff", '{"altitude": 5, "altitude": 9}', "takeoff: ", "object", '"altitude": 9'),
+    call("takeoff", '{"altitude": NaN}', "takeoff: altitude ", "1 to 50 m", "nan"),
+    call("takeoff", [5], "takeoff: ", "object", "'[5]'"),
+    call("takeoff", {"altitude": "high"}, "takeoff: altitude ", "1 to 50 m", "'high'"),
+    call("takeoff", {"altitude": 1000}, "takeoff: altitude ", "1 to 50 m", "1000"),
+    call("takeoff", {"altitude": True}, "takeoff: altitude ", "number", "'True'"),
+    call("takeoff", {"altitude": {"value": 5}}, "takeoff: altitude ", "number", "'value': 5"),
+    call("takeoff", {"altitude": math.nan}, "takeoff: altitude ", "1 to 50 m", "nan"),
+    call("takeoff", {"height": 5}, "takeoff: ", "'height'", "known: altitude"),
+    call("takeoff", {"altitude=5 speed": 5}, "takeoff: ", "'altitude=5 speed'"),
+    call("seek", {"class": "unicorn"}, "class 'unicorn'", "person, bicycle"),
+    call("seek", {}, "seek: class ", "missing", "seek CLASS"),
+    call("orbit", {"class": "car", "track": 3}, "orbit: ", "class or track or marker", "class and track"),
+    call("approach", {"track": 1.5}, "approach: track ", "track_id", "'1.5'"),
+    call("mission", {"file": "demo\n[[step]]"}, "mission "),
+    call("mission", {"file": "demo"}, "mission "),
+    call("policy", {"file": "a.onnx", "class": "car"}, "policy "),
+    call("Mission", {"file": "demo"}, "command 'Mission'", "takeoff, land"),
+    call("velocity", {}, "velocity "),
+    call('"mission"', {"file": "/tmp/other.toml"}, """command '"mission"'"""),
+    call('"policy"', {"file": "a.onnx", "class": "car"}, """command '"policy"'"""),
+    call('"velocity"', {}, """command '"velocity"'"""),
+    call('"takeoff"', {}, """command '"takeoff"'""", "takeoff?"),
+    call("Takeoff", {}, "command 'Takeoff'", "takeoff?"),
+    call(" takeoff", {}, "command ' takeoff'", "takeoff?"),
+    call(None, {}, "tool 'None'"),
+    call(["seen"], {}, "tool ", "['seen']"),
+    row(
+        "condition that no command expresses",
+        lambda _: understand("find the purple dog unless it barks", SCENE),
+        UnclearError,
+        "'unless barks'",
+    ),
+    row(
+        "altitude of a sentence",
+        lambda _: understand("take off to nine hundred metres", SCENE),
+        GrammarError,
+        "takeoff: altitude ",
+        "1 to 50 m",
+        "900",
+    ),
+]
+
 POSITION = (1.0, 2.0, -3.0)
 URL = "udpin://0.0.0.0:14540"
 
@@ -375,7 +509,37 @@ def setpoint(name: str, values: dict[str, Any], *words: str) -> Row:
     return row(f"setpoint {name}", lambda _: Setpoint(0, **values), ValueError, "setpoint", *words)
 
 
+def metadata(content: bytes, *words: str) -> Row:
+    return row(f"metadata {content[:40]!r}", lambda _: EventCatalogue(content), PeerDataError, *words)
+
+
+def event_with(**changes: object) -> bytes:
+    """Events metadata of one event, number 1."""
+    event = {"name": "an_event", "message": "text", "arguments": [], **changes}
+    component = {"namespace": "px4", "event_groups": {"default": {"events": {"1": event}}}}
+    return json.dumps({"components": {"1": component}}).encode()
+
+
 VEHICLE = [
+    metadata(b"", "metadata", "JSON"),
+    metadata(b"{", "metadata", "JSON"),
+    metadata(b"[]", "metadata", "object"),
+    metadata(b"\xff", "metadata", "JSON"),
+    metadata(b"null", "metadata", "object"),
+    metadata(b"[" * 100_000, "metadata", "JSON", "recursion"),
+    metadata(b'{"components":' * 10_000, "metadata", "JSON", "recursion"),
+    metadata(b'{"components": 3}', "metadata, components: "),
+    metadata(b'{"components": {"1": 3}}', "metadata, components.1: "),
+    metadata(b'{"components": {"' + b"9" * 5000 + b'": {}}}', "metadata, components.9999", "integer"),
+    metadata(b'{"components": {"1": {"namespace": 5}}}', "metadata, components.1.namespace: "),
+    metadata(b'{"components": ' + b"9" * 5000 + b"}", "metadata", "JSON", "number"),
+    metadata(event_with(message=5), "metadata, components.1.", ".message: "),
+    metadata(event_with(message="x" * 1001), "metadata, components.1.", ".message: ", "1000"),
+    metadata(event_with(arguments=[{"name": "no type"}]), "metadata, components.1.", ".type: "),
+    metadata(
+        event_with(arguments=[{"type": "uint8_t"}] * 41), "metadata, components.1.", ".arguments: ", "40"
+    ),
+    metadata(b" " * (LARGEST_UNPACKED + 1), str(LARGEST_UNPACKED + 1), str(LARGEST_UNPACKED)),
     row(
         "driver",
         lambda _: open_driver("dronekit", URL),  # type: ignore[arg-type]
@@ -654,6 +818,29 @@ SIMULATOR = [
         "'4x4'",
     ),
     row(
+        "scene missing",
+        lambda f: load_scene(f / "field.toml"),
+        SceneError,
+        "field.toml: ",
+        "No such file",
+        "village",
+    ),
+    row(
+        "scene in Latin 1",
+        lambda f: load_scene(file(f, "field.toml", b"name = '\xff'")),
+        SceneError,
+        "field.toml: ",
+        "UTF-8",
+        "line 1",
+    ),
+    row(
+        "lens bent too far",
+        lambda _: Lens(CameraModel(160, 120, 104.0, 104.0, 81.0, 58.5, (-2.0, 0.0, 0.0, 0.0))),
+        ValueError,
+        "distortion (-2.0, ",
+        "160x120",
+    ),
+    row(
         "path of no object",
         lambda _: Scene(FULL, {4: ObjectPath((ORIGIN, (1.0, 0.0, 0.0)), 1.0)}),
         ValueError,
@@ -765,6 +952,10 @@ def lens(model: str, coefficients: int) -> Callable[[Path], object]:
     return lambda _: CameraModel(*numbers, (0.0,) * coefficients, model)  # type: ignore[arg-type]
 
 
+def of_numbers(numbers: tuple[float, float, float, float]) -> Callable[[Path], object]:
+    return lambda _: CameraModel(640, 480, *numbers)
+
+
 def depth(metres: Any = DEPTH, **values: Any) -> Callable[[Path], object]:
     return lambda _: cloud_from_depth(metres, CAMERA, **values)
 
@@ -857,6 +1048,15 @@ GEOMETRY = [
     row(
         "distortion_model", lens("thin_prism", 0), ValueError, "distortion_model", "plumb_bob", "'thin_prism'"
     ),
+    *(
+        row(f"lens {numbers}", of_numbers(numbers), ValueError, "finite")
+        for numbers in (
+            (math.nan, 450.0, 320.0, 240.0),
+            (450.0, math.nan, 320.0, 240.0),
+            (450.0, 450.0, math.nan, 240.0),
+            (450.0, 450.0, 320.0, math.nan),
+        )
+    ),
     row(
         "level image",
         lambda _: level_image(
@@ -911,6 +1111,13 @@ GEOMETRY = [
     cloud("a.pcd", b"FIELDS x y\nSIZE 4 4\nTYPE F F\nPOINTS 1\nDATA binary\n" + bytes(8), "name z"),
     cloud("a.pcd", PCD.replace(b"TYPE F", b"TYPE \0") % (1, b"binary") + bytes(20), "TYPE"),
     cloud("a.xyz", b"1 2 3", ".ply or .pcd"),
+    row(
+        "cloud written as .las",
+        lambda f: write_cloud(f / "cloud.las", PointCloud(POINTS)),
+        CloudFileError,
+        "cloud.las",
+        ".ply or .pcd",
+    ),
     row(
         "voxel 0",
         lambda _: voxel_grid(PointCloud(POINTS), 0.0),
@@ -1119,6 +1326,25 @@ def stage(values: dict[str, Any], *words: str) -> Row:
     return row(f"stage {values}", lambda _: of("vision.training.training:Stage")(**made), ValueError, *words)
 
 
+def training(changes: dict[str, Any], *words: str) -> Row:
+    def make(_: Path) -> object:
+        small = of("vision.training.training:Stage")(64, 64, 4, 4)
+        values = {"class_names": ("red", "green"), "stages": (small,), **changes}
+        return of("vision.training.training:TrainingSettings")(**values)
+
+    return row(f"training {changes}", make, ValueError, *words)
+
+
+def three(**tracks: Any) -> Detections:
+    boxes = np.arange(12, dtype=np.float32).reshape(3, 4)
+    scores, classes = np.array([0.9, 0.5, 0.2], np.float32), np.array([0, 1, 1])
+    return Detections(boxes, scores, classes, ("person", "car"), **tracks)
+
+
+def highlighted(index: int) -> Callable[[Path], object]:
+    return lambda _: annotate(np.zeros((16, 16, 3), np.uint8), three(), highlight=index)
+
+
 def named_in_latin_1(suffix: str) -> Row:
     path = Path(os.fsdecode(b"caf\xe9" + suffix.encode()))
     return row(f"name of {suffix} in Latin 1", lambda _: read_source(path), CheckpointError, suffix, "UTF-8")
@@ -1253,13 +1479,39 @@ NETWORKS = [
     tracker({"min_hits": 0}, "1", "got 0"),
     tracker({"coast_timeout_s": 0.0}, "max_age_s", "0 and 2"),
     tracker({"coast_timeout_s": 3.0, "max_age_s": 2.0}, "3 and 2"),
+    training({"stages": ()}, "one stage"),
+    training({"learning_rate": 0.0}, "learning rate"),
+    training({"average_decay": 1.0}, "average_decay"),
+    row(
+        "track_id alone",
+        lambda _: three(track_id=np.array([1, 2, 3])),
+        ValueError,
+        "track_id, track_score, track_confirmed",
+        "track_score is",
+    ),
+    row(
+        "tracks of two boxes",
+        lambda _: three(
+            track_id=np.arange(1, 4),
+            track_score=np.zeros(3, np.float32),
+            track_confirmed=np.zeros(2, np.bool_),
+        ),
+        ValueError,
+        "track_confirmed",
+        "(3,)",
+        "(2,)",
+    ),
+    *(
+        row(f"highlight {index}", highlighted(index), IndexError, "highlight", "0..2", f"got {index}")
+        for index in (-1, 3)
+    ),
     stage({"rate": 0.0}, "rate of a stage", "rate=0.0"),
     stage({"decay_steps": -1}, "decay_steps of a stage", "decay_steps=-1"),
     stage({"decay_steps": 101}, "decay_steps of a stage", "decay_steps=101"),
     stage({"width": 100}, "32 pixels", "100x64"),
 ]
 
-PACKAGES = [SERVICE, SETTINGS, GUIDANCE, VEHICLE, SIMULATOR, TOOLS, GEOMETRY, SOURCES, NETWORKS]
+PACKAGES = [SERVICE, SETTINGS, GUIDANCE, LANGUAGE, VEHICLE, SIMULATOR, TOOLS, GEOMETRY, SOURCES, NETWORKS]
 ROWS = [each for package in PACKAGES for each in package]
 
 
