@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mavlink_sim.camera.depth_camera import DepthSensor, measured_depth
 from mavlink_sim.camera.image_effects import ImageEffects, Sensor
-from mavlink_sim.camera.lens import CameraMotion, Lens, Shutter
+from mavlink_sim.camera.lens import CameraMotion, Shutter
 from mavlink_sim.camera.renderer import Renderer
 from mavlink_sim.world.fiducials import Print
 from mavlink_sim.world.world import Ground, World, WorldObject
@@ -138,11 +138,6 @@ def test_exposure_blurs_only_along_motion() -> None:
 
     sharp, smeared = detail(CameraMotion()), detail(CameraMotion(velocity_mps=(15.0, 0.0, 0.0)))
     assert smeared[0] / sharp[0] < 0.6 * smeared[1] / sharp[1]
-
-
-def test_unsupported_distortion_refused() -> None:
-    with pytest.raises(ValueError, match="weaker coefficients"):
-        Lens(bent((-2.0, 0.0, 0.0, 0.0)))
 
 
 IMAGES = {

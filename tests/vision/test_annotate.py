@@ -6,7 +6,6 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
@@ -135,12 +134,6 @@ def test_label_marks_unconfirmed_tracks() -> None:
     assert without < plate(7, True) < plate(7, False) < plate(7777, False)
     left, _, right, _ = changed(image, annotate(image, plain))
     assert right - left == without
-
-
-@pytest.mark.parametrize("highlight", [-1, 1])
-def test_invalid_highlight_is_rejected(highlight: int) -> None:
-    with pytest.raises(IndexError, match=rf"highlight .*0\.\.0, got {highlight}"):
-        annotate(make_image(), seen([[1, 1, 5, 5]]), highlight=highlight)
 
 
 def test_neighbouring_classes_have_colours_far_apart() -> None:

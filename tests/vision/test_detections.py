@@ -61,20 +61,6 @@ def test_records_contain_the_track_fields() -> None:
     assert {(r["track_id"], r["track_score"], r["track_state"]) for r in three()} == {(None, None, None)}
 
 
-def test_track_arrays_are_all_given_or_none() -> None:
-    with pytest.raises(ValueError, match=r"track_id, .*; track_score"):
-        three(track_id=np.array([1, 2, 3]))
-
-
-def test_track_arrays_have_one_entry_per_box() -> None:
-    with pytest.raises(ValueError, match=r"track_confirmed .*\(3,\) .*got \(2,\)"):
-        three(
-            track_id=np.array([1, 2, 3]),
-            track_score=np.zeros(3, np.float32),
-            track_confirmed=np.zeros(2, np.bool_),
-        )
-
-
 @pytest.mark.parametrize(
     "detections",
     [three(), tracked(), tracked()[:0], tracked()[::2], Detections.empty(("person", "car"))],

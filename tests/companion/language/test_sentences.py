@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from companion.guidance.command import GrammarError
 from companion.guidance.grammar import parse
 from companion.language.clauses import UnclearError
 from companion.language.numbers_in_words import with_numbers
@@ -66,16 +65,6 @@ def test_unknown_colour_is_asked_back(text: str) -> None:
     one = replace(SCENE, objects=(SCENE.objects[0], SceneObject("car", 5)))
     sentence = "circle the red car"
     assert "track=3" in str(understand(sentence, one).intents[0])
-
-
-def test_a_condition_no_command_expresses_is_not_dropped() -> None:
-    with pytest.raises(UnclearError):
-        understand("find the purple dog unless it barks", SCENE)
-
-
-def test_value_out_of_range_is_the_grammars_error() -> None:
-    with pytest.raises(GrammarError, match="altitude"):
-        understand("take off to nine hundred metres", SCENE)
 
 
 def test_unknown_height_and_heading_are_asked_back() -> None:

@@ -155,8 +155,3 @@ def test_damaged_files_give_one_error(tmp_path_factory: Any, junk: bytes, suffix
     except CloudFileError:
         return
     assert cloud.points.shape[1] == 3
-
-
-def test_a_name_of_another_kind_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(CloudFileError, match="ply"):
-        write_cloud(tmp_path / "cloud.las", TWO)

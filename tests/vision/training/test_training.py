@@ -223,19 +223,6 @@ def test_each_stage_has_its_own_decay() -> None:
     assert rates[100] == pytest.approx(0.1)
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        pytest.param({"stages": ()}, "one stage", id="no stage"),
-        pytest.param({"learning_rate": 0.0}, "learning rate", id="no rate"),
-        pytest.param({"average_decay": 1.0}, "average_decay", id="an average that never moves"),
-    ],
-)
-def test_impossible_settings_are_rejected(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        replace(SMALL, **change)
-
-
 def wrong_size(rng: np.random.Generator, width: int, height: int) -> LabelledImage:
     return rectangles(rng, width + 1, height)
 
