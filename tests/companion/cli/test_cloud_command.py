@@ -184,7 +184,7 @@ def test_other_bad_input_is_one_line(frame: Frame, tmp_path: Path) -> None:
         assert f"write {missing}: " in line
         assert "such folder" in line
         assert "missing" in refused(URI, output, "--cloud-view", tmp_path / "missing" / "a.png")
-        assert "camera.horizontal_fov_deg" in refused(URI, output, "--camera-horizontal-fov-deg", "-1")
+        assert "horizontal_fov_deg" in refused(URI, output, "--camera-horizontal-fov-deg", "-1")
     with shared(frame, replace(DEFAULT_MOUNT, on_gimbal=True)):
         assert "gimbal" in refused(URI, output, "--cloud-frame", "body")
         assert run(URI, output, "--cloud-frame", "camera").exit_code == 0
