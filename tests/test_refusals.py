@@ -928,7 +928,7 @@ TOOLS = [
     ),
     row("flight", lambda _: flight_named("nix"), UnknownFlightError, "'nix'", "approach, approach-depth"),
     row("no flights", lambda _: summary("follow", []), ValueError, "follow: ", "no flights"),
-    row("compiled already", compile_simulator, FileExistsError, "test_error"),
+    row("compiled already", lambda f: compile_simulator(file(f, "built", b"")), FileExistsError, "built"),
     row("no flight", lambda f: read_flight(file(f, "a.tlog", b"")), ValueError, "a.tlog", "ATTITUDE"),
 ]
 
