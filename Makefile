@@ -16,6 +16,11 @@ PAGE_TESTS := tests/companion/dashboard
 AXE := $(PAGE_TESTS)/node_modules/axe-core/axe.min.js
 # GPL, and used by tests alone: in an environment of its own.
 MAVPROXY := .venv-mavproxy/bin/mavproxy.py
+# A real ROS 2 from PyPI's wheels, each release in an environment of its own, without what rclpy does not need.
+JAZZY := ros-jazzy-rclpy==7.1.6 ros-rmw-fastrtps-cpp==8.4.3 ros-sensor-msgs==5.3.6
+KILTED := ros-kilted-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-kilted-sensor-msgs==5.5.1
+ROS_TESTS := tests/companion/ros2
+ROS_READER := $(ROS_TESTS)/node_modules/.package-lock.json
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -48,7 +53,7 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
 
-programs: debian $(AXE) $(MAVPROXY)
+programs: debian $(AXE) $(MAVPROXY) $(ROS_READER) .venv-ros-jazzy/.installed .venv-ros-kilted/.installed
 
 debian:
 	@packages=$$($(PYTHON) -m tests.programs debian) || exit 1; test -n "$$packages" || exit 0; export packages; \
@@ -62,6 +67,18 @@ $(MAVPROXY): constraints.txt
 	@test -x $(@D)/python || $(PYTHON) -m venv .venv-mavproxy
 	@$(call TRY,MAVProxy,$(@D)/python -m pip install --quiet --constraint constraints.txt pymavlink pyserial==3.5; $(@D)/python -m pip install --quiet --no-deps MAVProxy==1.8.75)
 	@touch $@
+
+$(ROS_READER): $(ROS_TESTS)/package-lock.json | debian
+	@$(call TRY,rosmsg2-serialization,cd $(ROS_TESTS); npm ci --ignore-scripts)
+	@touch $@
+
+.venv-ros-jazzy/.installed: ROS := $(JAZZY)
+.venv-ros-kilted/.installed: ROS := $(KILTED)
+# Where there are no wheels, the tests are left out.
+.venv-ros-%/.installed: tests/ros_interfaces.py companion/ros2/definitions.py | debian
+	@test -n "$$($(PYTHON) -m tests.programs wheels)" || { echo "make programs: no wheels of ROS 2 for this machine"; exit 0; }; \
+	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D) || exit 1; \
+	$(call TRY,ROS 2 $*,$(@D)/bin/python -m pip install --quiet $(ROS); PYTHONPATH=. $(@D)/bin/python tests/ros_interfaces.py > /dev/null; touch $@)
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -83,4 +100,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-mavproxy $(PAGE_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-mavproxy .venv-ros-* $(PAGE_TESTS)/node_modules $(ROS_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache

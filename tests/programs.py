@@ -2,12 +2,14 @@
 
 A test with `pytest.mark.needs(name)` is left out where that is not here; it fails with
 COMPANION_TEST_PROGRAMS=required, as in `.ci/run`. `python -m tests.programs` says in one line what is left
-out and how to get it; `python -m tests.programs debian` names the packages of Debian that are missing.
+out and how to get it; `python -m tests.programs debian` names the packages of Debian that are missing, and
+`python -m tests.programs wheels` the machine if there are wheels of ROS 2 for it.
 """
 
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import sys
 import sysconfig
@@ -25,6 +27,13 @@ NODE = shutil.which("node")
 MAVPROXY = shutil.which("mavproxy.py", path=str(HERE.parent / ".venv-mavproxy" / "bin")) or shutil.which(
     "mavproxy.py"
 )
+ROS_PYTHONS = {
+    name: HERE.parent / f".venv-ros-{name.lower()}" / "bin" / "python" for name in ("Jazzy", "Kilted")
+}
+"""Release of ROS 2: its Python, with rclpy and the messages of `companion.ros2.definitions`."""
+ROS_WHEELS = f"{sys.platform}-{platform.machine()}" == "linux-x86_64" and sys.version_info[:2] <= (3, 13)
+ROS_READER = HERE / "companion" / "ros2" / "node_modules" / "@foxglove" / "rosmsg2-serialization"
+PYTHON_HEADER = Path(sysconfig.get_path("include"), "Python.h")
 COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
 
 MAKE = "`make programs`, on Debian as root"
@@ -50,6 +59,20 @@ def program(name: str, tests: str, debian: str) -> Need:
     return Need(shutil.which(name) is not None, tests, debian=debian)
 
 
+def ros(release: str) -> Need:
+    """A release of ROS 2. Its messages are compiled."""
+    return Need(
+        ROS_PYTHONS[release].parents[1].joinpath(".installed").is_file(),
+        f"messages and nodes of ROS 2 {release}",
+        MAKE if ROS_WHEELS else "there are wheels for Linux on x86-64 and Python 3.11 to 3.13",
+        debian=" ".join(
+            package
+            for package, here in (("g++", shutil.which("g++")), ("python3-dev", PYTHON_HEADER.is_file()))
+            if ROS_WHEELS and not here
+        ),
+    )
+
+
 NEEDS = {
     "chromium": Need(CHROMIUM is not None, "the page in a browser", debian="chromium"),
     "node": program("node", "the page's functions", "nodejs"),
@@ -58,6 +81,9 @@ NEEDS = {
     "openssl": program("openssl", "zenoh with TLS", "openssl"),
     "systemd-analyze": program("systemd-analyze", "the exposure of the units", "systemd"),
     "C compiler": program(COMPILER, "the compiled simulator", "gcc"),
+    "ROS 2 Jazzy": ros("Jazzy"),
+    "ROS 2 Kilted": ros("Kilted"),
+    "rosmsg2-serialization": Need(ROS_READER.is_dir(), "messages of ROS 2 as Foxglove reads them"),
     "autopilot": Need("COMPANION_SITL_URL" in os.environ, "SITL", "docs/how-to/sitl.md"),
     "test data": Need(DATA.is_dir(), "real flights, photographs and networks", "COMPANION_TEST_DATA"),
 }
@@ -76,5 +102,6 @@ def left_out(needs: Mapping[str, Need] = NEEDS) -> str:
 
 if __name__ == "__main__":
     packages = [need.debian for need in NEEDS.values() if need.debian and not need.here]
-    if line := " ".join(packages) if sys.argv[1:] == ["debian"] else left_out():
+    lines = {"debian": " ".join(dict.fromkeys(packages)), "wheels": platform.machine() if ROS_WHEELS else ""}
+    if line := lines[sys.argv[1]] if sys.argv[1:] else left_out():
         print(line)
