@@ -80,7 +80,7 @@ OPERATORS_PROGRAMS = (
     "companion.cli.client",
     "companion.cli.mcp",
     "companion.client.drone",
-    "companion.ros2.messages",
+    "companion.ros2.bag",  # of `companion log convert`
 )
 # The same inside `companion.guidance`: its folders, and its own files.
 GUIDANCE_LAYERS = {

@@ -82,20 +82,24 @@ def convert_recording(
             metavar="OUTPUT", help="The new file: NAME.mcap, or NAME.tlog for the recorded MAVLink."
         ),
     ],
+    ros2: Annotated[bool, typer.Option("--ros2", help="Write an .mcap that is a bag of ROS 2.")] = False,
 ) -> None:
     """Copy a recording to a new, complete file.
 
     An .mcap has all that can be read of a damaged one. A .tlog has the MAVLink of both directions, for ground
-    stations.
+    stations. With --ros2 an .mcap has the topics of the ROS 2 node, for `ros2 bag` and rosbags.
     """
     from companion.logs.tlog import write_tlog
     from companion.recording import RecordingError
     from companion.recording.files import recover
+    from companion.ros2.bag import write_bag
 
-    if output.suffix not in (".mcap", ".tlog"):
-        refuse(f"{output}: expected a name that ends in .mcap or .tlog")
+    suffixes = (".mcap",) if ros2 else (".mcap", ".tlog")
+    if output.suffix not in suffixes:
+        refuse(f"{output}: expected a name that ends in {' or '.join(suffixes)}")
+    convert = write_bag if ros2 else recover if output.suffix == ".mcap" else write_tlog
     with plain_errors(RecordingError):
-        problems, count = (recover if output.suffix == ".mcap" else write_tlog)(file, output)
+        problems, count = convert(file, output)
     for line in problems:
         typer.echo(f"companion: {line}", err=True)
     typer.echo(f"{output}: {count} {'messages' if output.suffix == '.mcap' else 'MAVLink messages'}")
