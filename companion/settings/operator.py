@@ -8,7 +8,13 @@ from pydantic import Field, model_validator
 
 from companion.settings.perception import VideoSection
 from companion.settings.section import Section
-from companion.settings.texts import HOST_AND_PORT, HOST_AND_PORT_OR_EMPTY
+from companion.settings.texts import (
+    HOST_AND_PORT,
+    HOST_AND_PORT_OR_EMPTY,
+    ROS_NAME,
+    ROS_NAMESPACE,
+    ZenohEndpoint,
+)
 
 
 class DashboardSection(Section):
@@ -49,6 +55,25 @@ class FoxgloveSection(Section):
 
     listen: Annotated[str | None, HOST_AND_PORT] = None
     """HOST:PORT of Foxglove's WebSocket, such as 127.0.0.1:8765 (extra `recording`); unset: disabled"""
+
+
+class Ros2Section(Section):
+    """ROS 2: the node of `companion ros2 node`, and rmw_zenoh from the service itself."""
+
+    namespace: Annotated[str | None, ROS_NAMESPACE] = None
+    """of node and topics, and before the names of frames; empty: none; unset: the vehicle's name"""
+    node_name: Annotated[str, ROS_NAME] = "companion"
+    """name of the node"""
+    domain_id: Annotated[int | None, Field(ge=0, le=232)] = None
+    """domain of ROS; unset: that of the variable ROS_DOMAIN_ID, else 0"""
+    commands: bool = False
+    """execute object_to_seek and ~/command; cmd_vel acts under the command `velocity` alone"""
+    rmw_zenoh: bool = False
+    """publish for nodes with rmw_zenoh_cpp too, without ROS on this computer"""
+    router: ZenohEndpoint = "tcp/127.0.0.1:7447"
+    """zenoh router of those nodes"""
+    plain_keys: bool = False
+    """with rmw_zenoh, publish on the keys of zenoh-bridge-ros2dds instead"""
 
 
 class MetricsSection(Section):

@@ -16,6 +16,7 @@ from companion.settings.operator import (
     MetricsSection,
     PluginsSection,
     RecordingSection,
+    Ros2Section,
 )
 from companion.settings.perception import (
     CameraSection,
@@ -71,6 +72,7 @@ class Settings(Section):
     dashboard: DashboardSection = DashboardSection()
     language: LanguageSection = LanguageSection()
     foxglove: FoxgloveSection = FoxgloveSection()
+    ros2: Ros2Section = Ros2Section()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()

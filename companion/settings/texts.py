@@ -10,6 +10,11 @@ from pydantic import StringConstraints
 KEY_WORD = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=64)
 KeyWord = Annotated[str, KEY_WORD]
 HOST_AND_PORT = StringConstraints(pattern=r"^[^\s:]+:[0-9]{1,5}$", max_length=300)
+# Names of ROS 2: https://design.ros2.org/articles/topic_and_service_names.html
+ROS_NAME = StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=64)
+ROS_NAMESPACE = StringConstraints(
+    pattern=r"^([A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?$", max_length=200
+)
 HTTP_URL = StringConstraints(pattern=r"^https?://[^\s/]+(/\S*)?$", max_length=300)
 HOST_AND_PORT_OR_EMPTY = StringConstraints(pattern=r"^([^\s:]+:[0-9]{1,5})?$", max_length=300)
 # The same without a dot, since `cameras.NAME.source` is a key.
@@ -32,6 +37,10 @@ ZenohEndpoint = Annotated[
 PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "a word of letters, digits, `_`, `-` and `.`",
     r"^[^\s:]+:[0-9]{1,5}$": "HOST:PORT such as 127.0.0.1:9100",
+    r"^[A-Za-z_][A-Za-z0-9_]*$": "a word of letters, digits and `_` that does not begin with a digit",
+    r"^([A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?$": (
+        "names of letters, digits and `_`, separated by `/`, such as drone1; or empty"
+    ),
     r"^https?://[^\s/]+(/\S*)?$": "an address such as http://127.0.0.1:11434",
     r"^([^\s:]+:[0-9]{1,5})?$": "HOST:PORT such as 127.0.0.1:8088, or empty",
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
