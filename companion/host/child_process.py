@@ -1,4 +1,4 @@
-"""Programs beside the service, each a module in its own process: clients of the bus like any other.
+"""Programs beside the service, each in its own process: modules of ours, and ROS's node.
 
 Nothing in such a program can delay the service. It ends when its standard input is closed, which the parent
 holds: at the end of the context, and when the parent is killed.
@@ -12,8 +12,9 @@ import sys
 import threading
 import time
 from asyncio.subprocess import PIPE, STDOUT, Process
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, suppress
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, suppress
+from functools import partial
 
 from companion.host.passing import EXIT_PASSING
 from companion.host.restarts import LATER_S, Restarts
@@ -28,10 +29,11 @@ _UNSAID_S = 2.0  # a longer end is announced
 
 Say = Callable[[str], None]
 OnEnd = Callable[[str, bool], None]
+Start = Callable[[], Awaitable[tuple[Process, Callable[[], None]]]]
+"""Starts a process that prints to a pipe; returns it, and what closes its standard input."""
 
 
-@asynccontextmanager
-async def child_process(
+def child_process(
     name: str,
     module: str,
     argument: str,
@@ -39,15 +41,29 @@ async def child_process(
     *,
     on_end: OnEnd = lambda _why, _again: None,
     end_s: float = _END_S,
+) -> AbstractAsyncContextManager[None]:
+    """Run `python -m MODULE ARGUMENT` meanwhile, as `supervised`."""
+    return supervised(name, partial(_start_module, module, argument), say, on_end=on_end, end_s=end_s)
+
+
+@asynccontextmanager
+async def supervised(
+    name: str,
+    start: Start,
+    say: Say,
+    *,
+    on_end: OnEnd = lambda _why, _again: None,
+    end_s: float = _END_S,
 ) -> AsyncIterator[None]:
-    """Run `python -m MODULE ARGUMENT` meanwhile; started again after a crash (`Restarts`).
+    """Run a program meanwhile; started again after a crash (`Restarts`).
 
     Args:
-        name: for people. say: called in the loop with each new line that it prints, and with its end.
+        name: for people. start: starts it. say: called in the loop with each new line that it prints, and
+            with its end.
         on_end: called with why it has ended by itself, and whether it is started again.
         end_s: it is killed if it takes longer to end, seconds.
     """
-    running = spawn(_supervise(name, (module, argument), say, on_end, end_s), name)
+    running = spawn(_supervise(name, start, say, on_end, end_s), name)
     try:
         yield
     finally:
@@ -55,7 +71,7 @@ async def child_process(
         await asyncio.gather(running, return_exceptions=True)
 
 
-async def _supervise(name: str, words: tuple[str, str], say: Say, on_end: OnEnd, end_s: float) -> None:
+async def _supervise(name: str, start: Start, say: Say, on_end: OnEnd, end_s: float) -> None:
     restarts = Restarts()
     last = ""
 
@@ -68,7 +84,7 @@ async def _supervise(name: str, words: tuple[str, str], say: Say, on_end: OnEnd,
     while True:
         started_s = time.monotonic()
         try:
-            code = await _run_once(words, say_new, end_s)
+            code = await _run_once(start, say_new, end_s)
         except Exception as error:  # no process, a line above 64 KiB, or a fault of ours
             why = error_text(error)
         else:
@@ -86,12 +102,13 @@ async def _supervise(name: str, words: tuple[str, str], say: Say, on_end: OnEnd,
         await asyncio.sleep(restart.pause_s)
 
 
-async def _run_once(words: tuple[str, str], say: Say, end_s: float) -> int:
+async def _start_module(module: str, argument: str) -> tuple[Process, Callable[[], None]]:
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",  # import from the search path below, not from the working directory
         "-m",
-        *words,
+        module,
+        argument,
         stdin=PIPE,
         stdout=PIPE,
         stderr=STDOUT,
@@ -99,6 +116,12 @@ async def _run_once(words: tuple[str, str], say: Say, end_s: float) -> int:
         # Ctrl-C in the terminal is for the parent, which then closes the pipe.
         process_group=0,
     )
+    assert process.stdin is not None
+    return process, process.stdin.close
+
+
+async def _run_once(start: Start, say: Say, end_s: float) -> int:
+    process, close_input = await start()
     schedule_as_any_program(process.pid)
     try:
         assert process.stdout is not None
@@ -106,13 +129,12 @@ async def _run_once(words: tuple[str, str], say: Say, end_s: float) -> int:
             say(line.decode(errors="replace").rstrip())
         return await process.wait()
     finally:
+        close_input()  # which ends it
         await _end(process, end_s, say)
 
 
 async def _end(process: Process, end_s: float, say: Say) -> None:
-    """Close the pipe, which ends the process; kill it if it does not end."""
-    assert process.stdin is not None
-    process.stdin.close()
+    """Wait for the end of the process; kill it if it does not end."""
     unsaid_s = min(_UNSAID_S, end_s)
     if await _ended(process, unsaid_s):
         return
