@@ -79,6 +79,7 @@ OPERATORS_PROGRAMS = (
     "companion.cli.ask",
     "companion.cli.client",
     "companion.cli.mcp",
+    "companion.cli.ros2",
     "companion.client.drone",
     "companion.ros2.bag",  # of `companion log convert`
 )

@@ -27,6 +27,7 @@ from companion.cli.markers import MARKER_SETTINGS, markers
 from companion.cli.mcp import MCP_SETTINGS, mcp
 from companion.cli.models import models
 from companion.cli.play import play
+from companion.cli.ros2 import ros2
 from companion.cli.run import run
 from companion.cli.view import view
 from companion.host.journal import is_journal, redact_last_resort
@@ -59,6 +60,7 @@ for name, group in (
     ("models", models),
     ("calibrate", calibrate),
     ("bench", bench),
+    ("ros2", ros2),
 ):
     app.add_typer(group, name=name)
 

@@ -1,0 +1,359 @@
+"""The node as a process: finds the Python of ROS, starts the node, starts it again, and talks with it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import shutil
+import socket
+import subprocess
+import sys
+from asyncio.subprocess import PIPE, STDOUT, Process
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from threading import RLock, Thread
+from typing import Any
+
+import zenoh
+
+from companion.bus.client import NoAnswerError, client_settings, open_client
+from companion.host.child_process import supervised
+from companion.ros2 import node as protocol
+from companion.ros2.gateway import (
+    Gateway,
+    Losses,
+    ServiceClock,
+    follow_service,
+    frame_prefix,
+    namespace_of,
+    topic_name,
+)
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
+from companion.ros2.requests import STRING, TWIST, Requests
+from companion.settings import Settings, ZenohSection
+
+OnSerialized = Callable[[str, str, memoryview, int, int], None]
+"""(topic name, type name, CDR, received_ns, ros_now_ns): a message that the node received.
+
+CDR is valid during the call only. `received_ns` is CLOCK_MONOTONIC, `ros_now_ns` ROS time of the same moment.
+"""
+OnWanted = Callable[[RosTopic, str | None, bool], None]
+
+# A node without a sign of life for so long is killed, and started again.
+SILENT_S = 10.0
+_PROBE_S = 30.0
+# One that was killed is listed by the others for up to 20 s (the lease of DDS).
+NAMESAKE_S = 25.0
+_RETRY_S, _END_S = 2.0, 5.0
+
+
+class Ros2Error(RuntimeError):
+    """There is no ROS 2 here, or the node cannot be created. The message is one line."""
+
+
+def find_python(chosen: str | None) -> str:
+    """Return a Python that imports rclpy: the chosen one, else that of the sourced ROS.
+
+    Raises:
+        Ros2Error: there is none; it names what to source.
+    """
+    named = [chosen] if chosen else [shutil.which("python3"), "/usr/bin/python3", sys.executable]
+    tried = list(dict.fromkeys(python for python in named if python))
+    last = ""
+    for python in tried:
+        try:
+            done = subprocess.run(
+                [python, "-c", "import rclpy"], capture_output=True, text=True, timeout=_PROBE_S, check=False
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            last = str(error)
+            continue
+        if done.returncode == 0:
+            return python
+        last = next((line for line in done.stderr.splitlines() if "Error" in line), last)
+    setup = next(iter(sorted(map(str, Path("/opt/ros").glob("*/setup.bash")))), "/opt/ros/jazzy/setup.bash")
+    advice = "--python names another one" if "AMENT_PREFIX_PATH" in os.environ else f"first: source {setup}"
+    raise Ros2Error(f"no Python with rclpy (tried {', '.join(tried)}: {last}): {advice}")
+
+
+def node_command(python: str, name: str, namespace: str, arguments: Sequence[str] = ()) -> list[str]:
+    """Return the command of the node's process. `arguments`: for rclpy, from `--ros-args` on."""
+    options = {"name": name, "namespace": f"/{namespace}", "namesake_s": NAMESAKE_S}
+    return [python, protocol.__file__, json.dumps(options), *arguments]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeTopic:
+    """A topic that the node publishes, or, with `on_serialized`, subscribes to.
+
+    Attributes:
+        name: relative to the namespace, absolute, or of the node, as `~/result`.
+        latched: transient local.
+        reliable: else best effort. A subscription that is not reliable accepts all publishers; it becomes
+            reliable where all are.
+    """
+
+    name: str
+    type_name: str
+    on_serialized: OnSerialized | None = None
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 10
+
+    def described(self, channel: int) -> dict[str, Any]:
+        """Return what the node reads."""
+        about = {name: getattr(self, name) for name in ("name", "reliable", "latched", "depth")}
+        return {**about, "channel": channel, "type": self.type_name, "publish": self.on_serialized is None}
+
+
+class RosNode:
+    """The node as a sink of the gateway. It outlives its process, which may be started again.
+
+    Args:
+        command, environment: of the process. The functions are called in a thread that reads its frames.
+        on_ready: with the node's full name and its namespace, at each start.
+        on_wanted: when a topic of `offer` gets its first subscriber or loses the last one.
+        on_clock: with CLOCK_MONOTONIC, ROS time, nanoseconds, and whether the latter is simulated.
+        say: with a line.
+    """
+
+    def __init__(
+        self,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        *,
+        on_ready: Callable[[str, str], None],
+        on_wanted: OnWanted,
+        on_clock: Callable[[int, int, bool], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self._command, self._environment = command, environment
+        self._on_ready, self._on_wanted, self._on_clock, self._say = on_ready, on_wanted, on_clock, say
+        self._topics: list[NodeTopic] = []  # the index is the channel
+        self._channels: dict[str, int] = {}
+        self._outputs: dict[int, list[tuple[RosTopic, str | None]]] = {}
+        self._wanted: set[int] = set()
+        self._socket: socket.socket | None = None
+        self._lock, self._losses = RLock(), Losses(say)
+
+    async def start(self) -> tuple[Process, Callable[[], None]]:
+        """Start the process, for `supervised`."""
+        ours, theirs = socket.socketpair()
+        with theirs:
+            process = await asyncio.create_subprocess_exec(
+                *self._command,
+                stdin=theirs.fileno(),
+                stdout=PIPE,
+                stderr=STDOUT,
+                env=self._environment,
+                process_group=0,  # Ctrl-C is for the parent
+            )
+        ours.settimeout(SILENT_S)
+        with self._lock:
+            self._socket = ours
+            self._send_topics(0)
+        loop, ended = asyncio.get_running_loop(), False
+
+        def kill() -> None:
+            with suppress(ProcessLookupError):
+                process.kill()
+
+        def read() -> None:
+            self._read(ours)
+            if not ended:  # it has gone, or is stuck
+                loop.call_soon_threadsafe(kill)
+
+        def end() -> None:
+            nonlocal ended
+            ended = True
+            _shut(ours)
+            reading.join(_END_S)  # functions of zenoh may be at work in it
+
+        reading = Thread(target=read, name="ROS node", daemon=True)
+        reading.start()
+        return process, end
+
+    def offer(self, topics: Sequence[RosTopic], camera: str | None) -> None:
+        """Publish what is made of topics of the bus while there is a subscriber; a latched one always."""
+        names = [topic_name(topic, camera) for topic in topics]
+        self.declare(
+            *(
+                NodeTopic(name, each.type_name, None, each.reliable, each.latched, 1 if each.latched else 10)
+                for name, each in zip(names, topics, strict=True)
+            )
+        )
+        for name, topic in zip(names, topics, strict=True):
+            self._outputs.setdefault(self._channels[name], []).append((topic, camera))
+            if topic.latched or self._channels[name] in self._wanted:
+                self._on_wanted(topic, camera, True)
+
+    def declare(self, *topics: NodeTopic) -> None:
+        """Publish topics, or subscribe to them. One that is declared already stays as it is."""
+        with self._lock:
+            first = len(self._topics)
+            for topic in topics:
+                if self._channels.setdefault(topic.name, len(self._topics)) == len(self._topics):
+                    self._topics.append(topic)
+            self._send_topics(first)
+
+    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
+        """Publish CDR, as the sink of the gateway."""
+        self.send(name, payload)
+
+    def send(self, name: str, payload: bytes) -> None:
+        """Publish CDR on a declared topic. Without a process it is dropped."""
+        self._send(protocol.MESSAGE, self._channels[name], payload)
+
+    def _send_topics(self, first: int) -> None:
+        described = [topic.described(first + index) for index, topic in enumerate(self._topics[first:])]
+        self._send(protocol.TOPICS, 0, json.dumps(described).encode())
+
+    def _send(self, kind: int, channel: int, body: bytes) -> None:
+        with self._lock:
+            if self._socket is None:
+                return
+            try:
+                self._socket.sendall(protocol.FRAME.pack(kind, channel, len(body)))
+                self._socket.sendall(body)
+            except OSError:  # it has gone or is stuck: a frame may be sent in part
+                _shut(self._socket)
+
+    def _read(self, ours: socket.socket) -> None:
+        """Process the frames of a process until its end."""
+        body, header = memoryview(bytearray(1024)), memoryview(bytearray(protocol.FRAME.size))
+        try:
+            with ours, ours.makefile("rb") as stream:
+                while stream.readinto(header) == len(header):
+                    kind, channel, size = protocol.FRAME.unpack(header)
+                    if size > len(body):  # one buffer for all: an image of 900 kB is copied once
+                        body = memoryview(bytearray(size))
+                    if stream.readinto(body[:size]) != size:
+                        break
+                    self._on_frame(kind, channel, body[:size])
+        except TimeoutError:
+            self._say(f"node: no sign of life for {SILENT_S:g} s; killed")
+        except OSError:
+            pass
+        with self._lock:
+            self._socket = None
+        for channel in tuple(self._wanted):
+            self._set_wanted(channel, False)
+
+    def _on_frame(self, kind: int, channel: int, body: memoryview) -> None:
+        if kind == protocol.MESSAGE:
+            topic, stamps = self._topics[channel], protocol.RECEIVED.unpack_from(body)
+            assert topic.on_serialized is not None
+            try:
+                topic.on_serialized(topic.name, topic.type_name, body[protocol.RECEIVED.size :], *stamps)
+            except Exception as error:  # no message may end the thread
+                self._losses.add(f"{topic.name}: {error}")
+        elif kind == protocol.WANTED:
+            self._set_wanted(channel, bool(body[0]))
+        elif kind == protocol.CLOCK:
+            self._on_clock(*protocol.CLOCK_BODY.unpack(body))
+        elif kind == protocol.READY:
+            about = json.loads(bytes(body))
+            self._on_ready(about["name"], about["namespace"].strip("/"))
+
+    def _set_wanted(self, channel: int, wanted: bool) -> None:
+        (self._wanted.add if wanted else self._wanted.discard)(channel)
+        for topic, camera in self._outputs.get(channel, ()):
+            if not topic.latched:
+                self._on_wanted(topic, camera, wanted)
+
+
+def _shut(connection: socket.socket) -> None:
+    with suppress(OSError):  # it is already
+        connection.shutdown(socket.SHUT_RDWR)
+
+
+async def run_node(
+    settings: Settings,
+    python: str,
+    arguments: Sequence[str],
+    ended: asyncio.Event,
+    say: Callable[[str], None],
+) -> None:
+    """Run the node of a vehicle until `ended` is set. It waits for the service, however late it comes.
+
+    Raises:
+        Ros2Error: ROS refuses the node, for example its name.
+    """
+    section, vehicle = client_settings(settings.zenoh), settings.vehicle.name
+    clock, refused = ServiceClock(section), ""
+    with ExitStack() as stack:
+        if (session := await _open_session(stack, section, ended, say)) is None:
+            return
+        gateway: Gateway | None = None
+
+        def on_ready(name: str, namespace: str) -> None:
+            nonlocal gateway
+            if gateway is None:
+                messages = Messages(frame_prefix(namespace), clock.ros_time_ns)
+                gateway = Gateway(session, vehicle, messages, say)
+                node.offer(OUTPUT_TOPICS, None)
+                stack.callback(gateway.close)
+                kept = follow_service(session, vehicle, clock, on_cameras)
+                stack.callback(kept.clear)
+            say(f"node: up: {name}")
+
+        def on_wanted(topic: RosTopic, camera: str | None, wanted: bool) -> None:
+            assert gateway is not None
+            gateway.want(node, topic, camera, wanted)
+
+        def on_cameras(cameras: Sequence[str]) -> None:
+            for camera in set(cameras) - known:
+                known.add(camera)
+                node.offer([topic for topic in OUTPUT_TOPICS if topic.source.of_camera], camera)
+
+        def on_end(why: str, again: bool) -> None:
+            nonlocal refused
+            if not again:
+                refused = why
+                ended.set()
+
+        known: set[str] = set()
+        ros2 = settings.ros2
+        environment = os.environ | ({} if ros2.domain_id is None else {"ROS_DOMAIN_ID": str(ros2.domain_id)})
+        node = RosNode(
+            node_command(python, ros2.node_name, namespace_of(settings), arguments),
+            environment,
+            on_ready=on_ready,
+            on_wanted=on_wanted,
+            on_clock=clock.on_ros_time,
+            say=say,
+        )
+        requests = Requests(
+            session, vehicle, commands=ros2.commands, publish_result=partial(node.send, "~/result"), say=say
+        )
+        node.declare(
+            NodeTopic("~/result", STRING),
+            NodeTopic("cmd_vel", TWIST, requests.on_velocity, reliable=False, depth=1),
+            NodeTopic("object_to_seek", STRING, requests.on_object),
+            NodeTopic("~/command", STRING, requests.on_command),
+        )
+        async with supervised("node", node.start, say, on_end=on_end):
+            await ended.wait()
+    if refused:
+        raise Ros2Error(refused)
+
+
+async def _open_session(
+    stack: ExitStack, section: ZenohSection, ended: asyncio.Event, say: Callable[[str], None]
+) -> zenoh.Session | None:
+    """Wait for the service or its router; None: ended before."""
+    said = False
+    while not ended.is_set():
+        try:
+            return await asyncio.to_thread(stack.enter_context, open_client(section, timeout_s=0.0))
+        except NoAnswerError as error:
+            if not said:
+                say(f"{error}; retrying")
+            said = True
+        with suppress(TimeoutError):
+            await asyncio.wait_for(ended.wait(), _RETRY_S)
+    return None

@@ -1,0 +1,139 @@
+"""What ROS requests of the vehicle: velocities, an object to seek, commands."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import secrets
+from collections.abc import Callable
+from functools import partial
+from threading import Lock, Thread
+from typing import Any
+
+import zenoh
+
+from companion.bus.client import NoAnswerError, send_command
+from companion.bus.topics import VELOCITY
+from companion.host.peer_data import PeerDataError
+from companion.ros2.cdr import decode, encode
+
+STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+_CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
+# A mission takes so long.
+_TIMEOUT_S = 3600.0
+# A newer command ends the one before, so more than a few do not wait for their outcome at once.
+_MOST_COMMANDS = 16
+_DISABLED = "ros2.commands is false: the settings must allow commands from ROS"
+
+
+class Requests:
+    """Passes on what the node receives. Its functions are called in the node's thread, and return at once.
+
+    Args:
+        commands: whether commands are executed. Velocities are passed on in any case: the service uses them
+            only under its command `velocity`.
+        publish_result: called with each outcome, as CDR of a String with JSON, from any thread.
+        say: called with a line.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        vehicle: str,
+        *,
+        commands: bool,
+        publish_result: Callable[[bytes], None],
+        say: Callable[[str], None],
+    ) -> None:
+        self._session, self._vehicle, self._commands = session, vehicle, commands
+        self._publish_result, self._say = publish_result, say
+        self._source = f"ros2-{secrets.token_hex(4)}"
+        self._velocities = session.declare_publisher(
+            VELOCITY.key(vehicle),
+            encoding=VELOCITY.encoding,
+            congestion_control=zenoh.CongestionControl.DROP,
+            priority=VELOCITY.priority,
+            express=VELOCITY.express,
+        )
+        self._lock, self._running = Lock(), 0
+        self._object = ""  # that is sought now
+        self._request = 0
+
+    def on_velocity(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+        """Process a Twist: metres and radians per second, FLU. Raises ValueError: it is not used."""
+        twist = decode(type_name, payload)
+        linear, angular = twist["linear"], twist["angular"]
+        if not all(map(math.isfinite, (*linear.values(), *angular.values()))):
+            raise ValueError("a velocity is not a finite number")
+        body = {
+            "source": self._source,
+            "stamp_ns": received_ns,
+            "forward_mps": linear["x"],
+            "right_mps": -linear["y"],
+            "up_mps": linear["z"],
+            "turn_radps": -angular["z"],
+        }
+        self._velocities.put(json.dumps(body))
+
+    def on_object(self, name: str, type_name: str, payload: memoryview, *_: int) -> None:
+        """Process the name of a class: `seek` it, then `approach` it. The same again changes nothing."""
+        wanted = str(decode(type_name, payload)["data"]).strip()
+        if not _CLASS_NAME.fullmatch(wanted):
+            self._answer(wanted, {"success": False, "reason": f"{name}: expected the name of a class"})
+            return
+        with self._lock:
+            if wanted == self._object:
+                return
+            self._object = wanted
+            self._request += 1
+            request = self._request
+        self._start(wanted, partial(self._seek_and_go, wanted, request))
+
+    def on_command(self, name: str, type_name: str, payload: memoryview, *_: int) -> None:
+        """Process a command of the grammar."""
+        text = str(decode(type_name, payload)["data"])
+        self._start(text, partial(self._execute, text))
+
+    def _start(self, text: str, work: Callable[[], object]) -> None:
+        with self._lock:
+            refused = _DISABLED if not self._commands else ""
+            if self._running >= _MOST_COMMANDS:
+                refused = f"{_MOST_COMMANDS} commands wait for their outcome"
+            if not refused:
+                self._running += 1
+        if refused:
+            self._object = ""
+            self._answer(text, {"success": False, "reason": refused})
+            return
+
+        def run() -> None:
+            try:
+                work()
+            finally:
+                with self._lock:
+                    self._running -= 1
+
+        Thread(target=run, name="ROS command", daemon=True).start()
+
+    def _seek_and_go(self, wanted: str, request: int) -> None:
+        found = self._execute(f'seek "{wanted}"')
+        if found and request == self._request:
+            self._execute(f'approach "{wanted}"')
+        with self._lock:
+            if request == self._request:
+                self._object = ""
+
+    def _execute(self, text: str) -> bool:
+        """Send a command, and publish its outcome. Returns whether it has succeeded."""
+        try:
+            reply = send_command(
+                self._session, self._vehicle, text, timeout_s=_TIMEOUT_S, on_silent=self._say
+            )
+        except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
+            reply = {"success": False, "reason": str(error)}
+        self._answer(text, reply)
+        return bool(reply.get("success"))
+
+    def _answer(self, text: str, reply: dict[str, Any]) -> None:
+        self._publish_result(encode(STRING, {"data": json.dumps({"command": text, **reply})}))
