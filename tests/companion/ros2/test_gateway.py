@@ -1,0 +1,261 @@
+"""The gateway without ROS: names, the clock of the service, and that only what is wanted is read."""
+
+from __future__ import annotations
+
+import ast
+import json
+import queue
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.bus.client import client_settings, open_client
+from companion.bus.topics import LABELS, STATUS, VELOCITY
+from companion.host.peer_data import parse_object
+from companion.ros2 import node as node_file
+from companion.ros2.cdr import decode, encode
+from companion.ros2.gateway import (
+    Gateway,
+    ServiceClock,
+    follow_service,
+    frame_prefix,
+    namespace_of,
+    ros_name,
+    topic_name,
+)
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
+from companion.ros2.process import Ros2Error, find_python
+from companion.ros2.requests import STRING, TWIST, Requests
+from companion.settings import Settings, ZenohSection
+from tests.companion.ros2.ros_process import VEHICLE, WAIT_S, BusSide, bus
+
+__all__ = ["bus"]
+
+LOOPBACK = ZenohSection(connect=("tcp/127.0.0.1:7447",), mode="client")
+ELSEWHERE = ZenohSection(connect=("tcp/192.168.1.5:7447",), mode="client")
+BY_NAME = {topic.name: topic for topic in OUTPUT_TOPICS}
+
+
+def settings(**ros2: Any) -> Settings:
+    return Settings.model_validate({"vehicle": {"name": "drone-1"}, "ros2": ros2})
+
+
+def test_namespace_is_the_vehicle_or_the_setting() -> None:
+    assert namespace_of(settings()) == "drone_1"
+    assert namespace_of(settings(namespace="fleet/one")) == "fleet/one"
+    assert namespace_of(settings(namespace="")) == ""
+    assert (frame_prefix("a"), frame_prefix("")) == ("a/", "")
+
+
+@pytest.mark.parametrize("wrong", ["/drone", "drone/", "4x", "a b", "a//b"])
+def test_namespace_that_ros_would_refuse_is_refused(wrong: str) -> None:
+    with pytest.raises(ValueError, match=r"ros2\.namespace"):
+        settings(namespace=wrong)
+
+
+@given(st.text(st.characters(codec="ascii", categories=("L", "N", "P")), min_size=1))
+def test_any_name_becomes_one_of_ros(name: str) -> None:
+    assert re.fullmatch(r"[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*", ros_name(name))
+
+
+def test_topics_of_further_cameras_have_their_name() -> None:
+    assert topic_name(BY_NAME["labels"], None) == "labels"
+    assert topic_name(BY_NAME["labels"], "down-left") == "cameras/down_left/labels"
+    assert topic_name(BY_NAME["/tf"], "down-left") == "/tf"
+
+
+def test_node_file_is_python_3_10_of_the_standard_library_and_rclpy() -> None:
+    text = Path(node_file.__file__).read_text()
+    tree = ast.parse(text, feature_version=(3, 10))
+    names = {
+        alias.name.partition(".")[0]
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
+    names |= {
+        (node.module or "").partition(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)
+    }
+    assert names - sys.stdlib_module_names == {"rclpy"}
+    line = f"ruff check --isolated --target-version py310 --select F,E9 {node_file.__file__}"
+    done = subprocess.run([sys.executable, "-m", *line.split()], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+def test_stamps_on_this_host_follow_its_system_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = ServiceClock(LOOPBACK)
+    now_ns = time.monotonic_ns()
+    clock.on_status(now_ns)
+    clock.on_run(5)  # of the start of the service: the system clock was set since
+    assert abs(clock.ros_time_ns(now_ns) - time.time_ns()) < 50_000_000
+    unix_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: unix_ns() + 3600 * 10**9)
+    assert clock.ros_time_ns(time.monotonic_ns()) - unix_ns() > 3599 * 10**9
+
+
+@pytest.mark.parametrize(("endpoint", "age_ns"), [(ELSEWHERE, 0), (LOOPBACK, 60 * 10**9)])
+def test_stamps_of_another_host_follow_its_clock(endpoint: ZenohSection, age_ns: int) -> None:
+    clock = ServiceClock(endpoint)
+    clock.on_status(time.monotonic_ns() - age_ns)
+    clock.on_run(7 * 10**15)
+    assert abs(clock.ros_time_ns(10**9) - (7 * 10**15 + 10**9)) < 1_000_000
+
+
+def test_stamps_are_of_simulated_time_while_there_is_one_for_the_clock() -> None:
+    clock = ServiceClock(LOOPBACK)
+    now_ns = time.monotonic_ns()
+    clock.on_status(now_ns)
+    clock.on_ros_time(now_ns, 50 * 10**9, True)
+    assert clock.ros_time_ns(now_ns - 10**9) == 49 * 10**9
+    assert clock.ros_time_ns(now_ns - 60 * 10**9) == 0  # before the simulation began
+    clock.on_ros_time(now_ns, time.time_ns(), False)
+    assert abs(clock.ros_time_ns(now_ns) - time.time_ns()) < 10**9
+
+
+class ListSink:
+    """Keeps what is published."""
+
+    def __init__(self) -> None:
+        self.published: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
+
+    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
+        self.published.put((name, payload))
+
+
+@pytest.mark.realtime
+def test_bus_is_read_while_any_sink_wants_it(bus: BusSide) -> None:
+    lines: list[str] = []
+    labels = BY_NAME["labels"]
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), lines.append)
+        first, second = ListSink(), ListSink()
+        for sink in (first, first, second):  # the same again changes nothing
+            gateway.want(sink, labels, None, True)
+        bus.wait_for_reader(LABELS)
+        bus.put(LABELS, "car")
+        for sink in (first, second):
+            name, payload = sink.published.get(timeout=WAIT_S)
+            assert (name, decode(STRING, payload)) == ("labels", {"data": "car"})
+        gateway.want(first, labels, None, False)
+        bus.put(LABELS, b"\xff")  # not text: said, and the next one is used
+        bus.put(LABELS, "boat")
+        assert decode(STRING, second.published.get(timeout=WAIT_S)[1]) == {"data": "boat"}
+        assert first.published.empty()
+        assert len(lines) == 1
+        gateway.want(second, labels, None, False)
+        bus.wait_for_reader(LABELS, wanted=False)
+        gateway.close()
+
+
+@pytest.mark.realtime
+def test_cameras_of_the_status_are_followed(bus: BusSide) -> None:
+    cameras: queue.SimpleQueue[list[str]] = queue.SimpleQueue()
+    bus.put(STATUS, {"stamp_ns": time.monotonic_ns(), "cameras": {"down": {}}})
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        kept = follow_service(session, VEHICLE, ServiceClock(LOOPBACK), cameras.put)
+        assert cameras.get(timeout=WAIT_S) == ["down"]
+        kept.clear()
+
+
+def test_python_without_rclpy_is_one_line_with_what_to_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    with pytest.raises(Ros2Error) as raised:
+        find_python(sys.executable)
+    assert "source /opt/ros/" in str(raised.value)
+    assert sys.executable in str(raised.value)
+    assert "\n" not in str(raised.value)
+    with pytest.raises(Ros2Error, match="no_such_python"):
+        find_python("/no_such_python")
+
+
+def test_command_without_ros_has_exit_code_2() -> None:
+    command = [sys.executable, "-m", "companion.cli", "ros2", "node", "--python", sys.executable]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+
+
+@pytest.fixture
+def requests(bus: BusSide, request: pytest.FixtureRequest) -> Any:
+    results: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+
+    def on_result(payload: bytes) -> None:
+        results.put(json.loads(decode(STRING, payload)["data"]))
+
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        made = Requests(session, VEHICLE, commands=True, publish_result=on_result, say=print)
+        yield made, results
+
+
+def text_of(text: str) -> memoryview:
+    return memoryview(encode(STRING, {"data": text}))
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("name", ["", 'car" distance=0', "car\nland", "x" * 65])
+def test_object_that_is_no_name_of_a_class_is_refused(name: str, bus: BusSide, requests: Any) -> None:
+    made, results = requests
+    made.on_object("object_to_seek", STRING, text_of(name), 0, 0)
+    assert results.get(timeout=WAIT_S)["success"] is False
+    assert bus.commands.empty()
+
+
+@pytest.mark.realtime
+def test_object_that_is_not_found_is_not_approached(bus: BusSide, requests: Any) -> None:
+    made, results = requests
+    bus.reply = {"success": False, "reason": "not found"}
+    made.on_object("object_to_seek", STRING, text_of("car"), 0, 0)
+    assert results.get(timeout=WAIT_S)["reason"] == "not found"
+    assert bus.commands.get(timeout=WAIT_S) == 'seek "car"'
+    wait_until(lambda: made._object == "")
+    assert bus.commands.empty()
+
+
+@pytest.mark.realtime
+def test_same_object_again_changes_nothing_a_new_one_replaces_it(bus: BusSide, requests: Any) -> None:
+    made, _ = requests
+    answering = threading.Event()
+    bus.before_reply = lambda: answering.wait(WAIT_S)
+    for name in ("car", "car", "boat"):
+        made.on_object("object_to_seek", STRING, text_of(name), 0, 0)
+        if name == "car":
+            wait_until(lambda: bus.received >= 1)
+    answering.set()
+    wait_until(lambda: bus.received >= 3)
+    commands = [bus.commands.get(timeout=WAIT_S) for _ in range(3)]
+    assert sorted(commands) == ['approach "boat"', 'seek "boat"', 'seek "car"']
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["linear", "angular"])
+def test_twist_that_is_not_finite_is_not_sent(number: float, part: str, bus: BusSide, requests: Any) -> None:
+    made, _ = requests
+    received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    subscriber = bus.session.declare_subscriber(
+        VELOCITY.key(VEHICLE), lambda sample: received.put(parse_object(sample.payload.to_bytes()))
+    )
+    wait_until(lambda: made._velocities.matching_status.matching)
+    with pytest.raises(ValueError, match="finite"):
+        made.on_velocity("cmd_vel", TWIST, memoryview(encode(TWIST, {part: {"x": number}})), 1, 1)
+    right = memoryview(encode(TWIST, {"linear": {"x": 1.0, "y": 0.5}, "angular": {"z": -0.2}}))
+    made.on_velocity("cmd_vel", TWIST, right, 2, 2)
+    velocity = received.get(timeout=WAIT_S)
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert (velocity["stamp_ns"], velocity["forward_mps"], velocity["right_mps"]) == (2, 1.0, -0.5)
+    assert velocity["turn_radps"] == 0.2
+
+
+def wait_until(fits: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + WAIT_S
+    while not fits():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
