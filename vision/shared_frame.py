@@ -41,7 +41,7 @@ import mmap
 import os
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -205,8 +205,6 @@ class SharedFrameWriter:
 
     def write(self, frame: Frame) -> None:
         """Copy a frame in. Raises ValueError if its size or presence of depth differs from the segment's."""
-        if self._views is None:
-            raise ValueError(f"the writer of shared memory {self.name!r} is closed")
         if (frame.width, frame.height) != (self.width, self.height):
             raise ValueError(
                 f"shared memory {self.name!r} holds {self.width}x{self.height} frames, "
@@ -217,17 +215,29 @@ class SharedFrameWriter:
                 f"shared memory {self.name!r} was created {'with' if self.depth else 'without'} depth, "
                 f"the frame has {'none' if self.depth else 'depth'}"
             )
+        with self.slot(frame.sequence, frame.captured_ns) as (image, depth_m):
+            image[:] = frame.image
+            if depth_m is not None:
+                depth_m[:] = frame.depth_m
+
+    @contextlib.contextmanager
+    def slot(
+        self, sequence: int, captured_ns: int
+    ) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.float32] | None]]:
+        """The next frame's memory, to be filled inside the block: image, and depth if the segment has it.
+
+        Both are as in `Frame`. Readers get the frame at the end of the block; after an exception they do not.
+        """
+        if self._views is None:
+            raise ValueError(f"the writer of shared memory {self.name!r} is closed")
         header = self._views.header
         count = int(header[_WRITTEN])
         index = count % len(self._views.words)
         words = self._views.words[index]
         words[_LOCK] = 2 * count + 1
-        words[_SEQUENCE] = frame.sequence
-        words[_CAPTURED] = frame.captured_ns
-        self._views.images[index][:] = frame.image
-        depth = self._views.depths[index]
-        if depth is not None:
-            depth[:] = frame.depth_m
+        words[_SEQUENCE] = sequence
+        words[_CAPTURED] = captured_ns
+        yield self._views.images[index], self._views.depths[index]
         words[_LOCK] = 2 * count + 2
         header[_WRITTEN] = count + 1
         header[_HEARTBEAT] = time.monotonic_ns()
