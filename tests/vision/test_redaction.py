@@ -96,6 +96,7 @@ def test_what_is_redacted_stays_as_it_is(form: str) -> None:
         "udp://:5600?format=rtp-h264&payload=96",
         "rtsp://user@camera/stream?channel=1&subtype=0",
         "shm://companion-1-vehicle1",
+        "ros://camera/image_raw?depth=/camera/depth/image_raw&info=/camera/camera_info",
         "tcp/127.0.0.1:7447",
         "put them into the address: rtsp://USER:PASSWORD@10.0.0.5…",
         "vehicle.signing_key_file=/etc/companion/key",

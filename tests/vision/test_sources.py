@@ -247,6 +247,7 @@ def test_a_raw_file_is_read_with_the_format_and_size_given(tmp_path: Path) -> No
         pytest.param({}, "udp://127.0.0.1", "1 to 65535", id="no port"),
         pytest.param({}, "udp://127.0.0.1:1?format=vp9", "mpegts, rtp-h264", id="RTP format"),
         pytest.param({}, "shm://a/b", "plain file name", id="shared memory"),
+        pytest.param({}, "ros://a-b", "name of a topic", id="ROS topic"),
     ],
 )
 def test_open_failure_is_a_one_line_error(
@@ -267,7 +268,9 @@ def test_video_with_a_name_that_is_not_utf8_is_refused(video: Path, tmp_path: Pa
         open_source(str(copied))
 
 
-@pytest.mark.parametrize("uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front"])
+@pytest.mark.parametrize(
+    "uri", ["photo.png", "-", "rtsp://u:secret@cam/1", "udp://:5600", "shm://front", "ros://image_raw"]
+)
 @pytest.mark.parametrize("key", ["exposure_us", "gain"])
 def test_exposure_of_images_already_taken_is_refused(uri: str, key: str) -> None:
     with pytest.raises(SourceError, match=rf"source\.{key} .*\(/dev/video0") as error:

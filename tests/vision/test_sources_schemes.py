@@ -56,7 +56,7 @@ def test_registered_scheme_is_opened_with_address_and_settings(grey: str) -> Non
 def test_unknown_scheme_lists_the_known_ones(grey: str) -> None:
     with pytest.raises(SourceError) as caught:
         open_source("gray://x")
-    for scheme in ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", grey):
+    for scheme in ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "ros", grey):
         assert f" {scheme} (" in str(caught.value)
     assert "plugins.modules" in str(caught.value)
 
@@ -84,7 +84,7 @@ def test_wrong_result_of_a_plugin_is_one_line_and_is_closed() -> None:
     assert opened[0].closed
 
 
-@pytest.mark.parametrize("scheme", ["shm", "Grey", "1grey", "grey://", ""])
+@pytest.mark.parametrize("scheme", ["shm", "ros", "Grey", "1grey", "grey://", ""])
 def test_duplicate_or_malformed_scheme_is_rejected(scheme: str) -> None:
     before = SOURCES.known()
 

@@ -31,6 +31,7 @@ from vision.sources.opencv import quiet_opencv
 from vision.sources.paired import TOLERANCE_S, DepthImages, depth_error, paired_source
 from vision.sources.pipe import Fifo, PipeCapture, check_pipe_settings
 from vision.sources.registry import SOURCES, OpenSource, source
+from vision.sources.ros import SCHEME, RosAddress, parse_ros_address
 from vision.sources.sequential import SequentialSource
 from vision.sources.shared import SharedFrameCapture, check_name
 from vision.sources.source import (
@@ -43,7 +44,7 @@ from vision.sources.source import (
 
 _IMAGE_RATE_HZ = 10.0  # of images used as a camera without rate_hz
 # Their images are already taken when they arrive. A plug-in's scheme decides itself.
-_WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "realsense", "oak")
+_WITHOUT_EXPOSURE = ("file", "rtsp", "rtsps", "http", "https", "udp", "shm", "ros", "realsense", "oak")
 # Suffixes of names that may be a device's, a FIFO's or a mount's, which come by themselves.
 _OF_PIPES = ("", ".fifo", ".pipe")
 _NETWORK = ("rtsp", "rtsps", "http", "https")
@@ -70,6 +71,7 @@ def open_source(uri: str, settings: SourceSettings = SourceSettings()) -> Source
     | `udp://:5600`, `udp://239.1.2.3:5600` | MPEG-TS | the newest |
     | `udp://:5600?format=rtp-h264` | RTP: `rtp-h264`, `rtp-h265` or `rtp-jpeg` | the newest |
     | `shm://NAME` | shared memory of this host (`vision.shared_frame`), with depth | the newest |
+    | `ros://camera/image_raw`, `…?depth=TOPIC&info=TOPIC` | a ROS 2 topic, with depth | the newest |
 
     Plug-ins register other schemes with `vision.sources.registry.source`.
 
@@ -152,6 +154,8 @@ def check_address(uri: str, settings: SourceSettings) -> None:
         check_csi_program(uri)
     elif scheme == "shm":
         check_name(_rest(uri))
+    elif scheme == "ros":
+        parse_ros_address(uri)
 
 
 def _opener(scheme: str, name: str) -> OpenSource:
@@ -167,6 +171,8 @@ def _opener(scheme: str, name: str) -> OpenSource:
 def _open_with_depth(uri: str, depth_uri: str, settings: SourceSettings) -> Source:
     if uri == depth_uri == "-":
         raise SourceError("standard input cannot be both source.uri and source.depth")
+    if uri.startswith(SCHEME) and parse_ros_address(uri).depth is not None:
+        raise SourceError(f"{uri}: has the depth of its address: remove source.depth")
     if settings.loop:
         raise SourceError("source.loop cannot repeat two sources in step: remove it, or source.depth")
     registration = None
@@ -302,6 +308,20 @@ def _open_shared(uri: str, settings: SourceSettings) -> Source:
     check_name(_rest(uri))
     return LatestSource(
         uri, lambda: SharedFrameCapture(_rest(uri), settings), settings, advice="is its writer running?"
+    )
+
+
+@source("ros", "a ROS 2 image topic, by `companion ros2 node`")
+def _open_ros(uri: str, settings: SourceSettings) -> Source:
+    address = parse_ros_address(uri)
+    if address.depth is not None:
+        colour, depth = str(replace(address, depth=None)), str(RosAddress(address.depth))
+        return _open_with_depth(colour, depth, replace(settings, loop=False))
+    return LatestSource(
+        uri,
+        lambda: SharedFrameCapture(address.segment, settings),
+        settings,
+        advice="is `companion ros2 node` running, and are images published?",
     )
 
 

@@ -69,6 +69,7 @@ def test_missing_file_is_a_fault(key: str, tmp_path: Path) -> None:
         ("source.uri", ["--source", "nonsense://0"]),
         ("source.uri", ["--source", "csi://front"]),
         ("source.uri", ["--source", "shm://a/b"]),
+        ("source.uri", ["--source", "ros://camera/image-raw"]),
         ("source.depth", ["--source", "-", "--source-depth", "absent.png"]),
         ("detector", ["--source", "-", "--model", "absent"]),
         ("detector", ["--source", "-", "--model", "absent.onnx"]),
