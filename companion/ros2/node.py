@@ -33,6 +33,7 @@ CLOCK_BODY = struct.Struct("<qq?")  # as `RECEIVED`, and whether ROS time is sim
 TOPICS, MESSAGE, WANTED, READY, CLOCK = range(1, 6)
 EXIT_REFUSED = 2  # it has printed why it cannot work
 _PERIOD_S = 0.2
+_SAME_MOMENT_NS, _MOST_READINGS = 200_000, 5
 
 
 class _Bridge:
@@ -77,11 +78,19 @@ class _Bridge:
             if wanted != (channel in self._wanted):
                 self._wanted ^= {channel}
                 self.send(WANTED, channel, bytes([wanted]))
-        clock = self._node.get_clock()
-        now = CLOCK_BODY.pack(time.monotonic_ns(), clock.now().nanoseconds, clock.ros_time_is_active)
-        self.send(CLOCK, 0, now)
+        self.send(CLOCK, 0, CLOCK_BODY.pack(*self._now(), self._node.get_clock().ros_time_is_active))
         self._check_name()
         self._adapt_reliability()
+
+    def _now(self) -> tuple[int, int]:
+        """CLOCK_MONOTONIC and ROS time of the same moment: a busy computer pauses between two readings."""
+        for _ in range(_MOST_READINGS):
+            before_ns = time.monotonic_ns()
+            ros_ns = self._node.get_clock().now().nanoseconds
+            after_ns = time.monotonic_ns()
+            if after_ns - before_ns < _SAME_MOMENT_NS:
+                break
+        return after_ns, ros_ns
 
     def _adapt_reliability(self) -> None:
         """Subscribe reliably while all publishers are reliable: of large images most are lost without."""
@@ -128,8 +137,7 @@ class _Bridge:
         )
 
         def receive(payload: bytes) -> None:
-            ros_ns = self._node.get_clock().now().nanoseconds
-            self.send(MESSAGE, channel, RECEIVED.pack(time.monotonic_ns(), ros_ns), payload)
+            self.send(MESSAGE, channel, RECEIVED.pack(*self._now()), payload)
 
         if topic["publish"]:
             self._publishers[channel] = self._node.create_publisher(kind, name, profile)
