@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 ros2 = typer.Typer(help="ROS 2: a node beside the service.", no_args_is_help=True)
 
 
-@settings_command(ros2, *CLIENT_SETTINGS, "ros2")
+@settings_command(ros2, *CLIENT_SETTINGS, "ros2", "source.uri", "source.depth")
 def node(
     settings: Settings,
     ros_arguments: Annotated[
@@ -30,13 +30,14 @@ def node(
 ) -> None:
     """Run a ROS 2 node that publishes what the service of vehicle.name sees, and receives commands.
 
-    It needs a sourced ROS 2, Humble or later. The cameras with a source ros:// are those of the settings
-    file. Ctrl-C ends it.
+    It needs a sourced ROS 2, Humble or later. For cameras with a source ros:// give it the settings file or
+    --source of the service. Ctrl-C ends it.
     """
     from companion.bus.client import NoAnswerError
     from companion.bus.config import BusError
     from companion.ros2.process import Ros2Error, find_python, run_node
     from companion.service.ending import on_ending
+    from vision.sources import SourceError
 
     async def run() -> None:
         ended = asyncio.Event()
@@ -47,7 +48,7 @@ def node(
 
     if ros_arguments and ros_arguments[0] != "--ros-args":
         refuse(f"{ros_arguments[0]!r}: expected --ros-args after --")
-    with plain_errors(NoAnswerError, BusError, Ros2Error, code=EXIT_BAD_INPUT):
+    with plain_errors(NoAnswerError, BusError, Ros2Error, SourceError, code=EXIT_BAD_INPUT):
         asyncio.run(run())
     sys.stdout.flush()
     os._exit(0)  # a thread of zenoh that calls back while Python ends would abort it

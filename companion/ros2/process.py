@@ -32,6 +32,7 @@ from companion.ros2.gateway import (
     namespace_of,
     topic_name,
 )
+from companion.ros2.images import ros_cameras
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
 from companion.ros2.requests import STRING, TWIST, Requests
 from companion.settings import Settings, ZenohSection
@@ -281,10 +282,12 @@ async def run_node(
     """Run the node of a vehicle until `ended` is set. It waits for the service, however late it comes.
 
     Raises:
-        Ros2Error: ROS refuses the node, for example its name.
+        Ros2Error: ROS refuses the node, for example its name. SourceError: a wrong `ros://` address.
     """
     section, vehicle = client_settings(settings.zenoh), settings.vehicle.name
     clock, refused = ServiceClock(section), ""
+    uris = [uri for source in settings.sources().values() for uri in (source.uri, source.depth) if uri]
+    cameras = ros_cameras(uris, say)
     with ExitStack() as stack:
         if (session := await _open_session(stack, section, ended, say)) is None:
             return
@@ -336,6 +339,17 @@ async def run_node(
             NodeTopic("object_to_seek", STRING, requests.on_object),
             NodeTopic("~/command", STRING, requests.on_command),
         )
+
+        def on_image(*message: Any) -> None:
+            for camera in cameras:
+                camera.on_serialized(*message)
+
+        images = {topic: kind for camera in cameras for topic, kind in camera.topics.items()}
+        node.declare(
+            *(NodeTopic(topic, kind, on_image, reliable=False, depth=2) for topic, kind in images.items())
+        )
+        for camera in cameras:
+            stack.callback(camera.close)
         async with supervised("node", node.start, say, on_end=on_end):
             await ended.wait()
     if refused:
