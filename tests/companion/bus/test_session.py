@@ -11,8 +11,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, Literal
 from unittest.mock import Mock
@@ -26,6 +25,7 @@ from companion.bus.command_intake import LARGEST_COMMAND_BYTES
 from companion.bus.session import Bus, BusError
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
+from tests.companion.zenoh_router import router
 
 pytestmark = pytest.mark.realtime
 
@@ -48,33 +48,6 @@ class Events(list[tuple[str, str]]):
 
 async def refuse(text: str) -> dict[str, Any]:
     return {"success": False, "reason": f"no {text}"}
-
-
-def _route(port: int, ready: Connection) -> None:
-    config = zenoh.Config()
-    config.insert_json5("mode", '"router"')
-    config.insert_json5("listen/endpoints", json.dumps([f"tcp/127.0.0.1:{port}"]))
-    config.insert_json5("scouting/multicast/enabled", "false")
-    with zenoh.open(config):
-        ready.send(True)
-        ready.recv()
-
-
-@contextmanager
-def router(port: int) -> Iterator[multiprocessing.process.BaseProcess]:
-    """A zenoh router in a separate process, which can be killed."""
-    context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe()
-    process = context.Process(target=_route, args=(port, theirs), daemon=True)
-    process.start()
-    try:
-        assert ours.poll(WAIT_S), "the router did not start"
-        ours.recv()
-        yield process
-    finally:
-        process.kill()
-        process.join()
-        ours.close()
 
 
 async def test_publication_and_command() -> None:
