@@ -21,6 +21,7 @@ JAZZY := ros-jazzy-rclpy==7.1.6 ros-rmw-fastrtps-cpp==8.4.3 ros-sensor-msgs==5.3
 KILTED := ros-kilted-rclpy==9.1.2 ros-rmw-fastrtps-cpp==9.3.3 ros-kilted-sensor-msgs==5.5.1
 ROS_TESTS := tests/companion/ros2
 ROS_READER := $(ROS_TESTS)/node_modules/.package-lock.json
+PYZEROS := .venv-pyzeros/.installed
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 
@@ -53,7 +54,7 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
 
-programs: debian $(AXE) $(MAVPROXY) $(ROS_READER) .venv-ros-jazzy/.installed .venv-ros-kilted/.installed
+programs: debian $(AXE) $(MAVPROXY) $(ROS_READER) .venv-ros-jazzy/.installed .venv-ros-kilted/.installed $(PYZEROS)
 
 debian:
 	@packages=$$($(PYTHON) -m tests.programs debian) || exit 1; test -n "$$packages" || exit 0; export packages; \
@@ -80,6 +81,11 @@ $(ROS_READER): $(ROS_TESTS)/package-lock.json | debian
 	test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D) || exit 1; \
 	$(call TRY,ROS 2 $*,$(@D)/bin/python -m pip install --quiet $(ROS); PYTHONPATH=. $(@D)/bin/python tests/ros_interfaces.py > /dev/null; touch $@)
 
+$(PYZEROS): constraints.txt
+	@test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D)
+	@$(call TRY,pyzeros,$(@D)/bin/python -m pip install --quiet --constraint constraints.txt pyzeros==0.1.0 ros2-pyterfaces==0.3.0)
+	@touch $@
+
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -100,4 +106,4 @@ $(READY): pyproject.toml constraints.txt
 	touch $@
 
 clean:
-	rm -rf $(VENV) .venv-mavproxy .venv-ros-* $(PAGE_TESTS)/node_modules $(ROS_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) .venv-mavproxy .venv-pyzeros .venv-ros-* $(PAGE_TESTS)/node_modules $(ROS_TESTS)/node_modules demo-output build *.egg-info .pytest_cache .mypy_cache .ruff_cache

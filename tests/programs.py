@@ -34,6 +34,8 @@ ROS_PYTHONS = {
 ROS_WHEELS = f"{sys.platform}-{platform.machine()}" == "linux-x86_64" and sys.version_info[:2] <= (3, 13)
 ROS_READER = HERE / "companion" / "ros2" / "node_modules" / "@foxglove" / "rosmsg2-serialization"
 PYTHON_HEADER = Path(sysconfig.get_path("include"), "Python.h")
+# An implementation of rmw_zenoh's wire format; its requirements are of no other use.
+PYZEROS = HERE.parent / ".venv-pyzeros" / "bin" / "python"
 COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
 
 MAKE = "`make programs`, on Debian as root"
@@ -78,6 +80,7 @@ NEEDS = {
     "node": program("node", "the page's functions", "nodejs"),
     "axe-core": Need(AXE.is_file(), "the page's accessibility", debian="" if shutil.which("npm") else "npm"),
     "MAVProxy": Need(MAVPROXY is not None, "MAVProxy as a client"),
+    "pyzeros": Need(PYZEROS.is_file(), "rmw_zenoh with another implementation"),
     "openssl": program("openssl", "zenoh with TLS", "openssl"),
     "systemd-analyze": program("systemd-analyze", "the exposure of the units", "systemd"),
     "C compiler": program(COMPILER, "the compiled simulator", "gcc"),
