@@ -73,6 +73,7 @@ PROGRAMS = (
     "companion.dashboard.__main__",
     "companion.perception.worker",
     "companion.recording.__main__",
+    "companion.ros2.__main__",
 )
 # What an operator runs beside a flight.
 OPERATORS_PROGRAMS = (

@@ -31,7 +31,8 @@ from companion.vehicle.streamer import Streamer
 # Beginnings of the lines that its clients print when all is well.
 _ROUTINE = (RECORDING, RECORDED, LISTENING)
 # With low priority on a busy computer the recorder takes seconds to finish its file.
-_END_S = {"recorder": 20.0, "foxglove": 5.0}
+_END_S = {"recorder": 20.0, "foxglove": 5.0, "ros2": 5.0}
+_MODULES = {"recorder": "companion.recording", "foxglove": "companion.recording", "ros2": "companion.ros2"}
 
 
 def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
@@ -111,7 +112,7 @@ def limits_of(settings: Settings) -> Limits:
 async def clients_of(
     settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str, bool], None]
 ) -> AsyncIterator[None]:
-    """Run meanwhile the clients that are set: the recorder, and Foxglove live.
+    """Run meanwhile the clients that are set: the recorder, Foxglove live, and ROS 2 over zenoh.
 
     Args:
         on_event: called with (level, text).
@@ -129,6 +130,8 @@ async def clients_of(
         }
     if settings.foxglove.listen is not None:
         programs["foxglove"] = settings.foxglove.model_dump()
+    if settings.ros2.rmw_zenoh or settings.ros2.plain_keys:
+        programs["ros2"] = {"settings": settings.ros2.model_dump(mode="json")}
 
     def say(line: str) -> None:
         name, _, text = line.partition(": ")
@@ -149,7 +152,7 @@ async def clients_of(
             argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
             program = child_process(
                 name,
-                "companion.recording",
+                _MODULES[name],
                 argument,
                 say,
                 on_end=partial(on_state, name),

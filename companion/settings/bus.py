@@ -24,7 +24,7 @@ class ZenohSection(Section):
     config_file: str | None = None
     """zenoh's configuration file (JSON5): TLS, access control; its keys replace defaults of those above"""
     child_config_file: str | None = None
-    """the same for dashboard, recorder and Foxglove that the service starts; unset: config_file"""
+    """the same for dashboard, recorder, Foxglove and ROS 2 of the service; unset: config_file"""
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:

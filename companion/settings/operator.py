@@ -69,11 +69,11 @@ class Ros2Section(Section):
     commands: bool = False
     """execute object_to_seek and ~/command; cmd_vel acts under the command `velocity` alone"""
     rmw_zenoh: bool = False
-    """publish for nodes with rmw_zenoh_cpp too, without ROS on this computer"""
+    """a node for rmw_zenoh_cpp, from the service itself: without ROS on this computer"""
     router: ZenohEndpoint = "tcp/127.0.0.1:7447"
-    """zenoh router of those nodes"""
+    """zenoh router of rmw_zenoh and of the bridge; not an endpoint of zenoh.listen"""
     plain_keys: bool = False
-    """with rmw_zenoh, publish on the keys of zenoh-bridge-ros2dds instead"""
+    """the same on the keys of zenoh-bridge-ros2dds"""
 
 
 class MetricsSection(Section):
