@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
@@ -24,6 +25,11 @@ from companion.ros2.requests import STRING, TWIST, Requests
 from companion.settings import Settings, ZenohSection
 
 _RETRY_S, _WATCH_S = 2.0, 0.5
+_LARGEST_DOMAIN = 232
+
+
+class _DomainError(ValueError):
+    """ROS_DOMAIN_ID is no domain."""
 
 
 def main(argument: str) -> int:
@@ -35,12 +41,9 @@ def main(argument: str) -> int:
     options = json.loads(argument)
     settings = Settings.model_validate({"vehicle": {"name": options["vehicle"]}, "ros2": options["settings"]})
     try:
-        domain_id = settings.ros2.domain_id
-        if domain_id is None:
-            domain_id = int(os.environ.get("ROS_DOMAIN_ID") or 0)
-        name = NodeName(domain_id, namespace_of(settings), settings.ros2.node_name)
+        name = NodeName(_domain_id(settings), namespace_of(settings), settings.ros2.node_name)
         _run(settings, settings_in_child(options["zenoh"]), name, ending)
-    except (BusError, ValueError) as error:  # the variable, or zenoh's settings
+    except (BusError, _DomainError) as error:
         _say(str(error))
         return EXIT_REFUSED
     return 0
@@ -91,6 +94,15 @@ def _run(settings: Settings, section: ZenohSection, name: NodeName, ending: Even
                     else f"{PAUSED}{no_router}{_other(session)}; retrying"
                 )
             ending.wait(_WATCH_S)
+
+
+def _domain_id(settings: Settings) -> int:
+    if settings.ros2.domain_id is not None:
+        return settings.ros2.domain_id
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not re.fullmatch("[0-9]{1,3}", text) or int(text) > _LARGEST_DOMAIN:
+        raise _DomainError(f"ROS_DOMAIN_ID is {text!r}, expected 0 to {_LARGEST_DOMAIN}")
+    return int(text)
 
 
 def _open(stack: ExitStack, section: ZenohSection, ending: Event, missing: str = "") -> zenoh.Session | None:
