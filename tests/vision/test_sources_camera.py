@@ -176,7 +176,7 @@ def test_busy_camera_names_the_program_that_holds_it(
 
 def test_camera_without_the_control_is_refused(device: Path) -> None:
     """The file in the camera's place has no controls at all."""
-    with pytest.raises(SourceError, match=r"video0: .* source\.gain;"):
+    with pytest.raises(SourceError, match=r"video0: .*control .*\.gain;"):
         open_source("0", SourceSettings(gain=3.0))
     assert all(camera.released for camera in FakeCamera.opened)
 

@@ -91,4 +91,4 @@ def test_closed_standard_input_is_a_wrong_setting(tmp_path: Path) -> None:
         ["sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == WRONG
-    assert "standard input" in done.stderr
+    assert "input is closed" in done.stderr

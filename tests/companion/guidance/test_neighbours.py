@@ -130,7 +130,7 @@ def test_without_own_position_there_are_no_neighbours() -> None:
     others = neighbours.neighbourhood(replace(state_at(NOW_NS), latitude_deg=math.nan), NOW_NS)
     assert others.vehicles == ()
     assert others.problem is not None
-    assert "latitude and longitude" in others.problem
+    assert "longitude not received" in others.problem
 
 
 class Needy(Behaviour):

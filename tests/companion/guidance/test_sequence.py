@@ -237,6 +237,7 @@ def test_new_command_ends_the_mission_at_once() -> None:
     harness.command("hold")
     reason = behaviour.with_step(future.result()).reason
     assert reason.startswith("step 1 of 2 (hold ")
+    assert ": replaced " in reason
     assert reason.endswith(" hold")
     harness.run(10.0)
     assert "land" not in harness.autopilot.requests

@@ -96,6 +96,6 @@ def test_sticks_do_in_offboard_what_the_service_says(
     outcome = flight.outcome(identifier)
     assert (flight.state.mode is FlightMode.POSITION) is taken_over
     if taken_over:
-        assert known(outcome).reason.startswith("the pilot ")
+        assert known(outcome).reason.startswith("the pilot took")
     else:
         assert outcome is None

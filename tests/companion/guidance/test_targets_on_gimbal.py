@@ -122,7 +122,7 @@ def test_missing_gimbal_attitude_raises_with_the_reason() -> None:
         home_position_ned_m=(0.0, 0.0, 0.0),
     )
     history.add(state)
-    with pytest.raises(HistoryError, match=r"attitude .*gimbal"):
+    with pytest.raises(HistoryError, match=r"no attitude .*gimbal"):
         targets_from_detections([MIDDLE], T0, CAMERA, MOUNT, history)
     history = history_of(YawFrame.NORTH, gimbal_every=60)
     late_ns = T0 + 30 * STEP_NS

@@ -266,7 +266,7 @@ async def test_integer_parameters_are_sent_as_bytes(
 async def test_unknown_parameter_is_refused_by_name(
     driver: Driver, parameters: dict[str, tuple[int, bytes]]
 ) -> None:
-    with pytest.raises(CommandRefusedError, match=r"COM_NOT_THERE: "):
+    with pytest.raises(CommandRefusedError, match=r"THERE: .*no such"):
         await driver.get_parameter("COM_NOT_THERE")
     with pytest.raises(CommandRefusedError, match="16 characters"):
         await driver.get_parameter("A_NAME_LONGER_THAN_16")

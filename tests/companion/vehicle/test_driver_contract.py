@@ -73,7 +73,7 @@ async def test_state_parameters_modes_and_arming_of_two_vehicles(kind: DriverKin
             await driver.set_parameter("COM_OBL_RC_ACT", 4)
             assert await driver.get_parameter("COM_OF_LOSS_T") == 0.75
             assert await driver.get_parameter("COM_OBL_RC_ACT") == 4.0
-            with pytest.raises(CommandRefusedError, match=r"COM_NO_SUCH: "):
+            with pytest.raises(CommandRefusedError, match=r"SUCH: .*no such"):
                 await driver.get_parameter("COM_NO_SUCH")
 
             # Disarmed, PX4 accepts every mode, and in MISSION without a mission it is never ready to arm.

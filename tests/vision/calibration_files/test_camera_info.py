@@ -83,7 +83,7 @@ def test_unknown_orientation_is_refused(tmp_path: Path, keys: str) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "fact"),
     [
-        ("image_width: 640\n", "", "image_width"),
+        ("image_width: 640\n", "", "_width is missing"),
         ("image_width: 640", "image_width: 640.5", "640.5"),
         ("[438.783367, ", "[", "9 numbers, got 8"),
         ("[438.783367, 0.000000", "[438.783367, 1.5", "1.5"),

@@ -280,7 +280,7 @@ def test_a_wrong_entry_of_a_coco_file_is_named(
 def test_invalid_json_and_ambiguous_files_are_rejected(tmp_path: Path) -> None:
     path = coco(tmp_path)
     text(path.with_name("instances_train2017.json"), "{}")
-    with pytest.raises(DatasetError, match=r"instances_train2017\.json"):
+    with pytest.raises(DatasetError, match=r"several .*instances_train2017"):
         open_dataset(tmp_path)
     assert open_dataset(tmp_path, split="val").root == path
     with pytest.raises(DatasetError, match=r"x\.json: .*not JSON \("):
