@@ -12,7 +12,6 @@ from dataclasses import asdict, dataclass, field
 
 import zenoh
 from pyzeros import Node
-from pyzeros.builtin_msgs import Attachment
 from pyzeros.pub import token_keyexpr
 from pyzeros.qos import QosProfile
 from pyzeros.sub import RawSub
@@ -129,12 +128,11 @@ def on_token(session: zenoh.Session, kinds: dict[str, type], sample: zenoh.Sampl
 
 
 def on_sample(name: str, kind: type, sample: zenoh.Sample) -> None:
-    about = Attachment.deserialize(b"\0\1\0\0" + sample.attachment.to_bytes())
     value = asdict(kind.deserialize(sample.payload.to_bytes()))
     if "data" in value and not isinstance(value["data"], str):
         value["data"] = len(value["data"])
-    gid = bytes(about.source_gid).hex()
-    say(name=name, sequence=int(about.sequence_number), ns=int(about.source_timestamp), gid=gid, value=value)
+    # pyzeros itself would compile what reads an attachment.
+    say(name=name, attachment=sample.attachment.to_bytes().hex(), value=value)
 
 
 def main() -> None:

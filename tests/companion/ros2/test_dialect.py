@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import queue
 import socket
+import struct
 import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any
 
 import pytest
@@ -91,8 +93,13 @@ class Graph:
         return open_client(client_settings(ZenohSection(), (self.endpoint,)), timeout_s=WAIT_S)
 
     def node(self, session: zenoh.Session, *, plain: bool = False) -> ZenohNode:
+        now: set[tuple[str, str | None]] = set()
+
         def want(_node: object, topic: RosTopic, camera: str | None, wanted: bool) -> None:
-            self.wanted.put((topic.name, camera, wanted))
+            stream = topic.name, camera
+            if (stream in now) != wanted:  # as the gateway, which accepts repetitions
+                (now.add if wanted else now.discard)(stream)
+                self.wanted.put((*stream, wanted))
 
         return ZenohNode(session, NODE, plain=plain, want=want, say=self.said.put)
 
@@ -230,7 +237,8 @@ class Receiver:
         self._process = process
         self.tokens: dict[str, bool] = {}  # key: whether it is alive
         self.expected: dict[str, str] = {}  # key: the one that pyzeros would have
-        self.samples: dict[str, dict[str, Any]] = {}  # topic: the newest
+        # Of each topic that was decoded, the newest attachment: sequence, Unix time, 16, gid.
+        self.samples: dict[str, tuple[Any, ...]] = {}
 
     def read_until(self, condition: Callable[[Receiver], bool]) -> None:
         assert self._process.stdout is not None
@@ -242,7 +250,7 @@ class Receiver:
                 self.tokens[item["token"]] = item["alive"]
                 self.expected |= {item["token"]: item["expected"]} if item["expected"] else {}
             elif "name" in item:
-                self.samples[item["name"]] = item
+                self.samples[item["name"]] = struct.unpack("<qqB16s", bytes.fromhex(item["attachment"]))
 
     def ours(self) -> set[str]:
         """Tokens of our node that are alive."""
@@ -250,11 +258,10 @@ class Receiver:
 
 
 @contextmanager
-def receiving(endpoint: str, domain_id: int, topics: list[tuple[str, str]], cwd: Path) -> Iterator[Receiver]:
+def receiving(endpoint: str, domain_id: int, topics: list[tuple[str, str]]) -> Iterator[Receiver]:
     script = Path(__file__).with_name("pyzeros_receiver.py")
     command = [str(PYZEROS), str(script), endpoint, str(domain_id), json.dumps(topics)]
-    # It keeps compiled code in the working directory.
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=cwd) as process:
+    with subprocess.Popen(command, stdin=PIPE, stdout=PIPE) as process:
         try:
             yield Receiver(process)
         finally:
@@ -263,7 +270,7 @@ def receiving(endpoint: str, domain_id: int, topics: list[tuple[str, str]], cwd:
 
 @pytest.mark.realtime
 @pytest.mark.needs("pyzeros")
-def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted(tmp_path: Path) -> None:
+def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted() -> None:
     graph = Graph()
     names = {NODE.absolute(topic.name): topic for topic in OUTPUT_TOPICS}
 
@@ -277,13 +284,13 @@ def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted(tmp_path: P
         node = graph.node(ours)
         node.offer(OUTPUT_TOPICS, None)
         listed = [(topic.type_name, name) for name, topic in names.items()]
-        with receiving(graph.endpoint, NODE.domain_id, listed, tmp_path) as receiver:
+        with receiving(graph.endpoint, NODE.domain_id, listed) as receiver:
             publish(node)
             receiver.read_until(lambda seen: len(seen.samples) == len(names))
             receiver.read_until(lambda seen: len(seen.ours()) == len(names) + 1)
-            assert {sample["sequence"] for sample in receiver.samples.values()} == {1}
-            assert len({sample["gid"] for sample in receiver.samples.values()}) == len(names)
-            assert abs(receiver.samples["/tf"]["ns"] - time.time_ns()) < WAIT_S * 1e9
+            assert {sequence for sequence, *_ in receiver.samples.values()} == {1}
+            assert len({gid for *_, gid in receiver.samples.values()}) == len(names)
+            assert abs(receiver.samples["/tf"][1] - time.time_ns()) < WAIT_S * 1e9
             assert len(receiver.expected) == len(names)
             for token, expected in receiver.expected.items():
                 assert token == expected
@@ -292,7 +299,5 @@ def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted(tmp_path: P
             assert {graph.next_wanted()[2] for _ in names} == {False}
             with router(graph.port):
                 publish(node)
-                receiver.read_until(
-                    lambda seen: all(sample["sequence"] == 2 for sample in seen.samples.values())
-                )
+                receiver.read_until(lambda seen: all(sequence == 2 for sequence, *_ in seen.samples.values()))
                 receiver.read_until(lambda seen: len(seen.ours()) == len(names) + 1)
