@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
+from threading import Lock
 from typing import Any
 
 import zenoh
@@ -131,7 +132,8 @@ class ZenohNode:
         self._zid = str(session.zid())
         self._offered: dict[str, list[tuple[RosTopic, str | None]]] = {}
         self._publishers: dict[str, _Publisher] = {}
-        self._kept: list[object] = []  # tokens and subscribers
+        self._kept: list[object] = []  # tokens, subscribers and listeners
+        self._matching = Lock()
         if not plain:
             self._kept = [
                 session.liveliness().declare_token(name.token(self._zid)),
@@ -149,8 +151,7 @@ class ZenohNode:
                         name, topic.type_name, reliable=topic.reliable, latched=topic.latched, depth=depth
                     )
                 )
-            if self._publishers[name].matching:
-                self._want(self, topic, camera, True)
+            self._on_matching(name)
 
     def declare(self, *topics: NodeTopic) -> None:
         """Publish topics, or subscribe to them."""
@@ -163,8 +164,9 @@ class ZenohNode:
                 # rmw_zenoh has another hash of the token: all that counts is that no publisher shares it.
                 gid = hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
             if topic.on_serialized is None:
+                publisher = self._publishers[topic.name] = _Publisher(self._session, key, topic, gid)
                 on_matching = partial(self._on_matching, topic.name)
-                self._publishers[topic.name] = _Publisher(self._session, key, topic, gid, on_matching)
+                self._kept.append(publisher.plain.declare_matching_listener(on_matching))
             else:
                 self._kept.append(self._session.declare_subscriber(key, partial(self._on_sample, topic)))
 
@@ -179,9 +181,11 @@ class ZenohNode:
         except zenoh.ZError as error:
             self._losses.add(f"{name}: {first_line(error)}")
 
-    def _on_matching(self, name: str, status: zenoh.MatchingStatus) -> None:
-        for topic, camera in self._offered.get(name, ()):
-            self._want(self, topic, camera, bool(status.matching))
+    def _on_matching(self, name: str, _: zenoh.MatchingStatus | None = None) -> None:
+        with self._matching:  # zenoh's threads may overtake each other: what holds now is read again
+            status = self._publishers[name].plain.matching_status
+            for topic, camera in self._offered.get(name, ()):
+                self._want(self, topic, camera, bool(status.matching))  # type: ignore[attr-defined]
 
     def _on_sample(self, topic: NodeTopic, sample: zenoh.Sample) -> None:
         assert topic.on_serialized is not None
@@ -198,27 +202,19 @@ class ZenohNode:
 
 
 class _Publisher:
-    """Publishes one topic.
+    """Publishes one topic. `gid`: of its attachments; None: without.
 
-    Args:
-        gid: of its attachments; None: without.
-        on_matching: called when the first subscriber comes, and when the last one has gone.
+    Attributes:
+        plain: says whether there is a subscriber, which an advanced publisher does not.
     """
 
-    def __init__(
-        self,
-        session: zenoh.Session,
-        key: str,
-        topic: NodeTopic,
-        gid: bytes | None,
-        on_matching: Callable[[zenoh.MatchingStatus], None],
-    ) -> None:
+    def __init__(self, session: zenoh.Session, key: str, topic: NodeTopic, gid: bytes | None) -> None:
         self._gid, self._sequence = gid, count(1)
         reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT
         # rmw_zenoh has DROP too where it keeps the last samples: one frozen reader would stop the others.
         quality: dict[str, Any] = {"encoding": _CDR, "congestion_control": _DROP, "reliability": reliability}
-        self._plain = session.declare_publisher(key, **quality)
-        self._publisher: zenoh.Publisher | ext.AdvancedPublisher = self._plain
+        self.plain = session.declare_publisher(key, **quality)
+        self._publisher: zenoh.Publisher | ext.AdvancedPublisher = self.plain
         if topic.latched:
             replies = ext.RepliesConfig(congestion_control=_DROP)
             heartbeats = ext.MissDetectionConfig(heartbeat=_HEARTBEAT_S, sporadic_heartbeat=None)
@@ -230,13 +226,6 @@ class _Publisher:
                 publisher_detection=True,
                 **quality,
             )
-        # An advanced publisher does not say whether it has subscribers.
-        self._listener = self._plain.declare_matching_listener(on_matching)
-
-    @property
-    def matching(self) -> bool:
-        """Whether there is a subscriber."""
-        return bool(self._plain.matching_status.matching)  # type: ignore[attr-defined]
 
     def put(self, payload: bytes) -> None:
         """Publish a sample, from any thread. Raises zenoh.ZError."""
