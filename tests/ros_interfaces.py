@@ -19,6 +19,7 @@ from rosidl_generator_py import generate_py
 from rosidl_generator_type_description import generate_type_hash
 from rosidl_typesupport_c import generate_c as generate_type_support
 from rosidl_typesupport_fastrtps_c import generate_typesupport_fastrtps_c
+from rosidl_typesupport_introspection_c import generate_c as generate_introspection
 
 from companion.ros2.definitions import DEFINITIONS
 
@@ -26,7 +27,8 @@ PREFIX = Path(sys.prefix)
 SHARE, LIBRARIES, SITE = PREFIX / "share", PREFIX / "lib", Path(sysconfig.get_path("purelib"))
 PACKAGES = ("diagnostic_msgs", "tf2_msgs", "vision_msgs")
 FAST_DDS = "rosidl_typesupport_fastrtps_c"
-LINKED = (FAST_DDS, "rosidl_typesupport_c", "rosidl_runtime_c", "rcutils", "rmw", "fastcdr")
+INTROSPECTION = "rosidl_typesupport_introspection_c"  # Fast DDS of Jazzy registers a type by it
+LINKED = (FAST_DDS, INTROSPECTION, "rosidl_typesupport_c", "rosidl_runtime_c", "rcutils", "rmw", "fastcdr")
 
 
 def generate(package: str, folder: Path) -> None:
@@ -55,9 +57,10 @@ def generate(package: str, folder: Path) -> None:
     generate_type_hash(arguments("rosidl_generator_type_description"))
     generate_c(arguments("rosidl_generator_c"))
     generate_typesupport_fastrtps_c(arguments(FAST_DDS))
-    generate_type_support(arguments("rosidl_typesupport_c"), [FAST_DDS])
+    generate_introspection(arguments(INTROSPECTION))
+    generate_type_support(arguments("rosidl_typesupport_c"), [FAST_DDS, INTROSPECTION])
     generate_py(arguments("rosidl_generator_py"), ["rosidl_typesupport_c"])
-    for generator in ("rosidl_generator_c", FAST_DDS):
+    for generator in ("rosidl_generator_c", FAST_DDS, INTROSPECTION):
         header = f"{generator}__visibility_control.h"
         content = (SHARE / generator / "resource" / f"{header}.in").read_text()
         for mark, value in (("@PROJECT_NAME@", package), ("@PROJECT_NAME_UPPER@", package.upper())):
@@ -76,11 +79,18 @@ def build(package: str, folder: Path) -> None:
     for source in folder.glob("msg/*.py"):
         (installed / "msg" / source.name).write_text(source.read_text())
     (installed / "__init__.py").write_text("")
-    libraries = [*LIBRARIES.glob("lib*__rosidl_generator_*.so"), *LIBRARIES.glob(f"lib*__{FAST_DDS}.so")]
+    kinds = ("rosidl_generator_*", FAST_DDS, INTROSPECTION)
+    libraries = [
+        path for kind in kinds for path in LIBRARIES.glob(f"lib*__{kind}.so") if not path.is_symlink()
+    ]
     libraries += [LIBRARIES / f"lib{name}.so" for name in LINKED]
     sources = (*folder.rglob("*.cpp"), *folder.glob("*.o"))
     module = installed / f"{package}_s__rosidl_typesupport_c.so"
     run("g++", "-shared", "-fPIC", *includes, *sources, *libraries, "-o", module, cwd=folder)
+    for kind in (FAST_DDS, INTROSPECTION):  # ROS looks each up in a library of that name
+        link = LIBRARIES / f"lib{package}__{kind}.so"
+        link.unlink(missing_ok=True)
+        link.symlink_to(module)
     (SHARE / package / "msg").mkdir(parents=True, exist_ok=True)
     for path in (*folder.glob("msg/*.json"), *folder.glob("msg/*.msg"), *folder.glob("msg/*.idl")):
         (SHARE / package / "msg" / path.name).write_text(path.read_text())

@@ -323,7 +323,7 @@ class Messages:
             }
             for name, level, message, about in rows
         ]
-        return {"header": self._header(body["stamp_ns"], ""), "status": status}
+        return {"header": {**self._header(body["stamp_ns"], ""), "frame_id": ""}, "status": status}
 
 
 def _position_ns(body: _Body) -> int:

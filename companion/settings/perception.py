@@ -34,7 +34,7 @@ class SourceSection(Section):
     """Where frames come from."""
 
     uri: Annotated[str, Field(min_length=1)] = "/dev/video0"
-    """/dev/video0, csi://0, file, folder of images, FIFO, - (standard input), rtsp, http, udp, ros://…; none"""
+    """/dev/video0, csi://0, file, folder, FIFO, - (standard input), rtsp, http, udp, ros://…; none"""
     width: Annotated[int | None, Field(ge=16, le=16384)] = None
     """frame width, pixels; requested from a camera, required for raw frames from a pipe"""
     height: Annotated[int | None, Field(ge=16, le=16384)] = None

@@ -28,7 +28,7 @@ def refused(type_name: str, payload: bytes) -> str:
     return str(caught.value)
 
 
-def refusal(type_name: str, payload: bytes) -> str:
+def error_of(type_name: str, payload: bytes) -> str:
     """Why it is refused; empty: it is read. Any other error is raised."""
     try:
         decode(type_name, payload)
@@ -127,7 +127,7 @@ def test_a_huge_number_anywhere_is_read_or_refused(type_name: str) -> None:
     payload = encode(type_name, {})
     for at in range(4, len(payload) - 3, 4):
         changed = payload[:at] + b"\xff\xff\xff\xff" + payload[at + 4 :]
-        assert "\n" not in refusal(type_name, changed)
+        assert "\n" not in error_of(type_name, changed)
 
 
 @pytest.mark.parametrize(
@@ -167,7 +167,7 @@ def test_empty_text_without_its_zero_is_read() -> None:
 @given(st.sampled_from(list(DEFINITIONS)), st.binary(max_size=120))
 def test_any_bytes_are_read_or_refused(type_name: str, payload: bytes) -> None:
     for begin in (b"", b"\0\1\0\0"):
-        assert "\n" not in refusal(type_name, begin + payload)
+        assert "\n" not in error_of(type_name, begin + payload)
 
 
 @pytest.mark.parametrize(

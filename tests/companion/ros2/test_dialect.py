@@ -42,9 +42,9 @@ Wanted = tuple[str, str | None, bool]
 def test_keys_and_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
     listener, zid = NodeName(2, "", "listener"), "aac3178e146ba6f1fc6e6a4085e77f21"
     assert listener.token(zid) == f"@ros2_lv/2/{zid}/0/0/NN/%/%/listener"
-    heard = NodeTopic("chatter", STRING, lambda *_: None)
+    received = NodeTopic("chatter", STRING, lambda *_: None)
     entity = f"@ros2_lv/2/{zid}/0/10/MS/%/%/listener/%chatter"
-    assert listener.topic_token(zid, 10, heard) == f"{entity}/{CHATTER}/::,10:,:,:,,"
+    assert listener.topic_token(zid, 10, received) == f"{entity}/{CHATTER}/::,10:,:,:,,"
     talker, zid = NodeName(0, "", "talker"), "8b20917502ee955ac4476e0266340d5c"
     entity = f"@ros2_lv/0/{zid}/0/10/MP/%/%/talker/%chatter"
     assert (

@@ -24,7 +24,7 @@ from companion.bus.client import listen
 from mavlink_sim.testing import free_port
 from tests.companion.ros2.ros_process import EACH_ROS, ROOT, BusSide, bus, domain, running_node
 from tests.companion.service_process import heartbeats, running_service
-from tests.programs import ROS
+from tests.programs import ROS_PYTHONS
 from vision.frame import Frame
 from vision.shared_frame import SharedFrameWriter
 from vision.sources import SourceSettings, open_source
@@ -88,7 +88,7 @@ def publisher(ros: str, topic: str, kind: str, *arguments: str, **options: Any) 
     values = {"topic": topic, "kind": kind, "width": WIDTH, "height": HEIGHT, "rate_hz": RATE_HZ}
     text = json.dumps({**values, "depth": False, "clock_speed": 0.0, **options})
     process = subprocess.Popen(
-        [ROS[ros], PUBLISHER, text, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [ROS_PYTHONS[ros], PUBLISHER, text, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
     assert process.stdin is not None
     assert process.stdout is not None

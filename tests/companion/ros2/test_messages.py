@@ -329,6 +329,7 @@ def test_diagnostics_have_a_level_for_each_part(state: str, level: int) -> None:
     part = {**template["parts"][0], "name": "camera down", "state": state, "reason": "no frames"}
     cameras = {"down": {**template["perception"], "rate_hz": 29.5, "model": None}}
     message = of("/diagnostics", healthy=False, unhealthy=["a", "b"], parts=[part], cameras=cameras)
+    assert message["header"]["frame_id"] == ""
     service, guidance, down = message["status"]
     assert (service["name"], service["level"], service["message"]) == ("drone1/companion: service", 2, "a; b")
     assert guidance["name"] == "drone1/companion: guidance"
