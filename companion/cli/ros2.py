@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from companion.cli.flags import CLIENT_SETTINGS, EXIT_BAD_INPUT, plain_errors, refuse, settings_command
+from companion.host.load import with_load
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -39,12 +40,13 @@ def node(
     from companion.service.ending import on_ending
     from vision.sources import SourceError
 
+    def say(line: str) -> None:
+        print(with_load(line), flush=True)
+
     async def run() -> None:
         ended = asyncio.Event()
         _watch = on_ending(ended.set)
-        await run_node(
-            settings, find_python(python), ros_arguments or (), ended, lambda line: print(line, flush=True)
-        )
+        await run_node(settings, find_python(python), ros_arguments or (), ended, say)
 
     if ros_arguments and ros_arguments[0] != "--ros-args":
         refuse(f"{ros_arguments[0]!r}: expected --ros-args after --")

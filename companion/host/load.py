@@ -24,6 +24,7 @@ SLOWNESS = (
     "no result within",
     "no data for",
     "is stuck: no message for",
+    "no sign of life for",
     "the encoder was too slow",
     "not read within",
     "not ready within",

@@ -70,12 +70,16 @@ def find_python(chosen: str | None) -> str:
             done = subprocess.run(
                 [python, "-c", "import rclpy"], capture_output=True, text=True, timeout=_PROBE_S, check=False
             )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            last = str(error)
+        except OSError as error:
+            last = str(error.strerror)
+            continue
+        except subprocess.TimeoutExpired:
+            last = f"not ready within {_PROBE_S:g} s"
             continue
         if done.returncode == 0:
             return python
-        last = next((line for line in done.stderr.splitlines() if "Error" in line), last)
+        reasons = [line.partition(": ")[2] for line in done.stderr.splitlines() if "Error: " in line]
+        last = reasons[0] if reasons else f"exit code {done.returncode}"
     setup = next(iter(sorted(map(str, Path("/opt/ros").glob("*/setup.bash")))), "/opt/ros/jazzy/setup.bash")
     advice = "--python names another one" if "AMENT_PREFIX_PATH" in os.environ else f"first: source {setup}"
     raise Ros2Error(f"no Python with rclpy (tried {', '.join(tried)}: {last}): {advice}")

@@ -53,6 +53,7 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
         ("detect {} --model none --markers 4X4_50", ".mp4"),
     ),
     "detector.model": (("detect frame.png --model {}", ".onnx"), ("detect frame.png --model {}", ".pt")),
+    "ros2 node python": (("ros2 node --python {}", ".txt"),),
     "mcp token_file": (("mcp --listen 127.0.0.1:0 --token-file {}", ".txt"),),
     "send file": (("send --file {} --check", ".toml"),),
     "log replay files": (("log replay {}", ".mcap"),),
@@ -166,7 +167,7 @@ ELSEWHERE = {"view source", "play scene", "log replay model", "source.uri"}
 NO_FILES = {
     "seeds", "ray", "vehicle_url", "classes", "runtime", "precision", "device", "command", "key", "sentence",
     "allow", "listen", "changes", "camera", "split", "policy", "algorithm", "name", "url", "to", "board",
-    "dictionary", "printed", "identifiers", "paper", "frame", "markers",
+    "dictionary", "printed", "identifiers", "paper", "frame", "markers", "ros_arguments",
 }  # fmt: skip
 # What these readers take: an image by its content; any text as a passphrase or key; an empty settings file.
 _IMAGES = {
