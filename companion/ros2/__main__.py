@@ -18,10 +18,9 @@ from companion.bus.config import BusError
 from companion.host.child_process import EXIT_REFUSED, on_parent_end
 from companion.recording import LISTENING, PAUSED
 from companion.ros2.dialect import NodeName, ZenohNode
-from companion.ros2.gateway import Gateway, ServiceClock, follow_service, frame_prefix, namespace_of
-from companion.ros2.messages import OUTPUT_TOPICS, Messages
-from companion.ros2.process import NodeTopic
-from companion.ros2.requests import STRING, TWIST, Requests
+from companion.ros2.gateway import Gateway, ServiceClock, follow_service, namespace_of
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, frame_prefix
+from companion.ros2.requests import Requests
 from companion.settings import Settings, ZenohSection
 
 _RETRY_S, _WATCH_S = 2.0, 0.5
@@ -76,12 +75,7 @@ def _run(settings: Settings, section: ZenohSection, name: NodeName, ending: Even
         known: set[str] = set()
         requests = Requests(bus, vehicle, commands=ros2.commands, publish_result=publish_result, say=_say)
         for node in nodes:
-            node.declare(
-                NodeTopic("~/result", STRING),
-                NodeTopic("cmd_vel", TWIST, requests.on_velocity),
-                NodeTopic("object_to_seek", STRING, requests.on_object),
-                NodeTopic("~/command", STRING, requests.on_command),
-            )
+            node.declare(*requests.topics())
             node.offer(OUTPUT_TOPICS, None)
         stack.callback(follow_service(bus, vehicle, clock, offer).clear)
         routed = None

@@ -27,9 +27,8 @@ from companion.bus.config import first_line
 from companion.bus.topics import LARGEST_JSON_BYTES
 from companion.host.peer_data import copy_payload
 from companion.ros2.definitions import type_hash
-from companion.ros2.gateway import Losses, Sink, topic_name
+from companion.ros2.gateway import Losses, NodeTopic, Sink
 from companion.ros2.messages import RosTopic
-from companion.ros2.process import NodeTopic
 
 Want = Callable[[Sink, RosTopic, str | None, bool], None]
 
@@ -143,15 +142,11 @@ class ZenohNode:
     def offer(self, topics: Sequence[RosTopic], camera: str | None) -> None:
         """Publish what is made of topics of the bus while there is a subscriber."""
         for topic in topics:
-            name, depth = topic_name(topic, camera), 1 if topic.latched else 10
-            self._offered.setdefault(name, []).append((topic, camera))
-            if name not in self._publishers:
-                self.declare(
-                    NodeTopic(
-                        name, topic.type_name, reliable=topic.reliable, latched=topic.latched, depth=depth
-                    )
-                )
-            self._on_matching(name)
+            made = NodeTopic.made_of(topic, camera)
+            self._offered.setdefault(made.name, []).append((topic, camera))
+            if made.name not in self._publishers:
+                self.declare(made)
+            self._on_matching(made.name)
 
     def declare(self, *topics: NodeTopic) -> None:
         """Publish topics, or subscribe to them."""

@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from threading import Lock
 from typing import Any, Protocol
@@ -15,23 +16,14 @@ import zenoh
 from companion.bus.client import message_of, subscribe_kept
 from companion.bus.topics import RUN, STATUS
 from companion.host.peer_data import parse_object
-from companion.ros2.messages import Messages, RosTopic
+from companion.ros2.messages import Messages, RosTopic, ros_name, topic_name
 from companion.settings import Settings, ZenohSection
 
 # A status is younger than this where it is received. Its stamp is of another clock if it is not.
 _STATUS_AGE_NS = 2_000_000_000
 _THIS_HOST = re.compile(r"/(127\.|localhost|\[::1\])")
 _WARN_INTERVAL_S = 10.0
-
-
-def ros_name(name: str) -> str:
-    """Return a name of the bus as one of ROS: letters, digits and single `_`, no digit first.
-
-    >>> ros_name("drone-1"), ros_name("4x4")
-    ('drone_1', 'n4x4')
-    """
-    word = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "n"
-    return f"n{word}" if word[0].isdigit() else word
+_STAMPS_KEPT = 512  # of some seconds: images come after their detections
 
 
 def namespace_of(settings: Settings) -> str:
@@ -40,16 +32,36 @@ def namespace_of(settings: Settings) -> str:
     return ros_name(settings.vehicle.name) if given is None else given
 
 
-def frame_prefix(namespace: str) -> str:
-    """Return what begins the names of a vehicle's frames."""
-    return f"{namespace}/" if namespace else ""
+OnSerialized = Callable[[str, str, memoryview, int, int], None]
+"""(topic name, type name, CDR, received_ns, ros_now_ns): a message that a node received.
+
+CDR is valid during the call only. `received_ns` is CLOCK_MONOTONIC, `ros_now_ns` ROS time of the same moment.
+"""
 
 
-def topic_name(topic: RosTopic, camera: str | None) -> str:
-    """Return a topic's name below the namespace, or its absolute one. `camera`: None for the first."""
-    if camera is None or topic.name.startswith("/"):
-        return topic.name
-    return f"cameras/{ros_name(camera)}/{topic.name}"
+@dataclass(frozen=True, slots=True)
+class NodeTopic:
+    """A topic that a node publishes, or, with `on_serialized`, subscribes to.
+
+    Attributes:
+        name: relative to the namespace, absolute, or of the node, as `~/result`.
+        latched: transient local.
+        reliable: else best effort. A subscription that is not reliable accepts all publishers; it becomes
+            reliable where all are.
+    """
+
+    name: str
+    type_name: str
+    on_serialized: OnSerialized | None = None
+    reliable: bool = True
+    latched: bool = False
+    depth: int = 10
+
+    @staticmethod
+    def made_of(topic: RosTopic, camera: str | None) -> NodeTopic:
+        """Return the topic to publish for one of the bus. `camera`: as of `topic_name`."""
+        name, depth = topic_name(topic, camera), 1 if topic.latched else 10
+        return NodeTopic(name, topic.type_name, None, topic.reliable, topic.latched, depth)
 
 
 class ServiceClock:
@@ -67,21 +79,39 @@ class ServiceClock:
         self._here = self._may_be_here
         self._there_ns: int | None = None  # Unix time minus CLOCK_MONOTONIC of the service
         self._simulated_ns: int | None = None  # simulated time minus CLOCK_MONOTONIC of this host
+        self._given: dict[int, int] = {}
 
     def on_status(self, stamp_ns: int) -> None:
         """Process the stamp of a status, when it is received."""
-        self._here = self._may_be_here and abs(time.monotonic_ns() - stamp_ns) < _STATUS_AGE_NS
+        here = self._may_be_here and abs(time.monotonic_ns() - stamp_ns) < _STATUS_AGE_NS
+        if here != self._here:
+            self._here, self._given = here, {}
 
     def on_run(self, unix_offset_ns: int) -> None:
         """Process the difference of the clocks of the service's host."""
-        self._there_ns = unix_offset_ns
+        if unix_offset_ns != self._there_ns:
+            self._there_ns, self._given = unix_offset_ns, {}
 
     def on_ros_time(self, monotonic_ns: int, ros_ns: int, simulated: bool) -> None:
         """Process a reading of this host's CLOCK_MONOTONIC and of the clock of ROS."""
-        self._simulated_ns = ros_ns - monotonic_ns if simulated else None
+        offset_ns = ros_ns - monotonic_ns if simulated else None
+        if (offset_ns is None) != (self._simulated_ns is None):
+            self._given = {}
+        self._simulated_ns = offset_ns
 
     def ros_time_ns(self, stamp_ns: int) -> int:
-        """Return the ROS time of a stamp of the service; at least 0."""
+        """Return the ROS time of a stamp of the service, at least 0: always the same of the same stamp.
+
+        So all messages about a frame have equal stamps, by which `message_filters` finds them.
+        """
+        given = self._given.get(stamp_ns)
+        if given is None:
+            given = self._given[stamp_ns] = self._computed_ns(stamp_ns)
+            if len(self._given) > _STAMPS_KEPT:
+                self._given.pop(next(iter(self._given)), None)
+        return given
+
+    def _computed_ns(self, stamp_ns: int) -> int:
         offset_ns = _unix_offset_ns()
         if not self._here and self._there_ns is not None:
             stamp_ns += self._there_ns - offset_ns

@@ -12,7 +12,6 @@ import sys
 from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from threading import RLock, Thread
@@ -26,22 +25,16 @@ from companion.ros2 import node as protocol
 from companion.ros2.gateway import (
     Gateway,
     Losses,
+    NodeTopic,
     ServiceClock,
     follow_service,
-    frame_prefix,
     namespace_of,
-    topic_name,
 )
 from companion.ros2.images import ros_cameras
-from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
-from companion.ros2.requests import STRING, TWIST, Requests
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_prefix
+from companion.ros2.requests import Requests
 from companion.settings import Settings, ZenohSection
 
-OnSerialized = Callable[[str, str, memoryview, int, int], None]
-"""(topic name, type name, CDR, received_ns, ros_now_ns): a message that the node received.
-
-CDR is valid during the call only. `received_ns` is CLOCK_MONOTONIC, `ros_now_ns` ROS time of the same moment.
-"""
 OnWanted = Callable[[RosTopic, str | None, bool], None]
 
 # A node without a sign of life for so long is killed, and started again.
@@ -91,28 +84,10 @@ def node_command(python: str, name: str, namespace: str, arguments: Sequence[str
     return [python, protocol.__file__, json.dumps(options), *arguments]
 
 
-@dataclass(frozen=True, slots=True)
-class NodeTopic:
-    """A topic that the node publishes, or, with `on_serialized`, subscribes to.
-
-    Attributes:
-        name: relative to the namespace, absolute, or of the node, as `~/result`.
-        latched: transient local.
-        reliable: else best effort. A subscription that is not reliable accepts all publishers; it becomes
-            reliable where all are.
-    """
-
-    name: str
-    type_name: str
-    on_serialized: OnSerialized | None = None
-    reliable: bool = True
-    latched: bool = False
-    depth: int = 10
-
-    def described(self, channel: int) -> dict[str, Any]:
-        """Return what the node reads."""
-        about = {name: getattr(self, name) for name in ("name", "reliable", "latched", "depth")}
-        return {**about, "channel": channel, "type": self.type_name, "publish": self.on_serialized is None}
+def _described(topic: NodeTopic, channel: int) -> dict[str, Any]:
+    """Return what the node reads of a topic."""
+    about = {name: getattr(topic, name) for name in ("name", "reliable", "latched", "depth")}
+    return {**about, "channel": channel, "type": topic.type_name, "publish": topic.on_serialized is None}
 
 
 class RosNode:
@@ -184,16 +159,12 @@ class RosNode:
 
     def offer(self, topics: Sequence[RosTopic], camera: str | None) -> None:
         """Publish what is made of topics of the bus while there is a subscriber; a latched one always."""
-        names = [topic_name(topic, camera) for topic in topics]
-        self.declare(
-            *(
-                NodeTopic(name, each.type_name, None, each.reliable, each.latched, 1 if each.latched else 10)
-                for name, each in zip(names, topics, strict=True)
-            )
-        )
-        for name, topic in zip(names, topics, strict=True):
-            self._outputs.setdefault(self._channels[name], []).append((topic, camera))
-            if topic.latched or self._channels[name] in self._wanted:
+        made = [NodeTopic.made_of(topic, camera) for topic in topics]
+        self.declare(*made)
+        for topic, to_publish in zip(topics, made, strict=True):
+            channel = self._channels[to_publish.name]
+            self._outputs.setdefault(channel, []).append((topic, camera))
+            if topic.latched or channel in self._wanted:
                 self._on_wanted(topic, camera, True)
 
     def declare(self, *topics: NodeTopic) -> None:
@@ -214,7 +185,7 @@ class RosNode:
         self._send(protocol.MESSAGE, self._channels[name], payload)
 
     def _send_topics(self, first: int) -> None:
-        described = [topic.described(first + index) for index, topic in enumerate(self._topics[first:])]
+        described = [_described(topic, first + index) for index, topic in enumerate(self._topics[first:])]
         self._send(protocol.TOPICS, 0, json.dumps(described).encode())
 
     def _send(self, kind: int, channel: int, body: bytes) -> None:
@@ -337,12 +308,7 @@ async def run_node(
         requests = Requests(
             session, vehicle, commands=ros2.commands, publish_result=partial(node.send, "~/result"), say=say
         )
-        node.declare(
-            NodeTopic("~/result", STRING),
-            NodeTopic("cmd_vel", TWIST, requests.on_velocity, reliable=False, depth=1),
-            NodeTopic("object_to_seek", STRING, requests.on_object),
-            NodeTopic("~/command", STRING, requests.on_command),
-        )
+        node.declare(*requests.topics())
 
         def on_image(*message: Any) -> None:
             for camera in cameras:

@@ -17,6 +17,7 @@ from companion.bus.client import NoAnswerError, send_command
 from companion.bus.topics import VELOCITY
 from companion.host.peer_data import PeerDataError
 from companion.ros2.cdr import decode, encode
+from companion.ros2.gateway import NodeTopic
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 _CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
@@ -59,6 +60,15 @@ class Requests:
         self._lock, self._running = Lock(), 0
         self._object = ""  # that is sought now
         self._request = 0
+
+    def topics(self) -> tuple[NodeTopic, ...]:
+        """Return what a node subscribes to, and the topic of the outcomes."""
+        return (
+            NodeTopic("~/result", STRING),
+            NodeTopic("cmd_vel", TWIST, self.on_velocity, reliable=False, depth=1),
+            NodeTopic("object_to_seek", STRING, self.on_object),
+            NodeTopic("~/command", STRING, self.on_command),
+        )
 
     def on_velocity(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
         """Process a Twist: metres and radians per second, FLU. Raises ValueError: it is not used."""

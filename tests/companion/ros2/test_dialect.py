@@ -21,9 +21,8 @@ from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.topics import DETECTIONS
 from companion.ros2.cdr import decode, encode
 from companion.ros2.dialect import NodeName, ZenohNode, attachment
-from companion.ros2.gateway import Gateway
+from companion.ros2.gateway import Gateway, NodeTopic
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
-from companion.ros2.process import NodeTopic
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
 from tests.companion.zenoh_router import router

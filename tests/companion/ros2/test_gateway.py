@@ -23,16 +23,8 @@ from companion.bus.topics import LABELS, STATUS, VELOCITY
 from companion.host.peer_data import parse_object
 from companion.ros2 import node as node_file
 from companion.ros2.cdr import decode, encode
-from companion.ros2.gateway import (
-    Gateway,
-    ServiceClock,
-    follow_service,
-    frame_prefix,
-    namespace_of,
-    ros_name,
-    topic_name,
-)
-from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic
+from companion.ros2.gateway import Gateway, ServiceClock, follow_service, namespace_of
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_prefix, ros_name, topic_name
 from companion.ros2.process import Ros2Error, find_python
 from companion.ros2.requests import STRING, TWIST, Requests
 from companion.settings import Settings, ZenohSection
@@ -259,3 +251,13 @@ def wait_until(fits: Callable[[], object]) -> None:
     while not fits():
         assert time.monotonic() < deadline_s
         time.sleep(0.02)
+
+
+def test_messages_of_one_frame_have_one_stamp() -> None:
+    clock, stamp_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    first = clock.ros_time_ns(stamp_ns)
+    for later in range(100):
+        clock.ros_time_ns(stamp_ns + later)
+    assert {clock.ros_time_ns(stamp_ns) for _ in range(100)} == {first}
+    clock.on_ros_time(stamp_ns, 5 * 10**9, True)
+    assert clock.ros_time_ns(stamp_ns) == 5 * 10**9

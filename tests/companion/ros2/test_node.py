@@ -20,7 +20,8 @@ from companion.bus.topics import CAMERA_INFO, DETECTIONS, IMAGE, LABELS, STATUS,
 from companion.host.child_process import supervised
 from companion.host.peer_data import parse_object
 from companion.ros2.cdr import encode
-from companion.ros2.process import NodeTopic, RosNode, node_command
+from companion.ros2.gateway import NodeTopic
+from companion.ros2.process import RosNode, node_command
 from mavlink_sim.testing import running_simulator
 from tests.companion.ros2.ros_process import (
     EACH_ROS,
