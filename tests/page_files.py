@@ -131,6 +131,44 @@ GIVEN = {
 }
 
 
+# As installed, but vehicles climb quickly, cameras have fewer images, and a service detects at half the size.
+COMPANION = f"""#!{sys.executable}
+import os, sys
+from companion import cli
+if __name__ == "__main__":
+    command = sys.argv[1:2]
+    if command in (["play"], ["run"]):
+        os.environ["COMPANION_DETECTOR_IMAGE_SIZE"] = "320"
+    if command == ["play"]:
+        from companion.simulation import play, session
+        from mavlink_sim.testing import QUICK_FLIGHT
+        session.SIMULATOR_PARAMETERS.update(QUICK_FLIGHT)
+        play._CAMERA_RATE_HZ = 5.0
+    cli.main()
+"""
+SIMULATOR = f"""#!{sys.executable}
+import sys
+from mavlink_sim.__main__ import main
+from mavlink_sim.testing import QUICK_FLIGHT
+if __name__ == "__main__":
+    words = sys.argv[1:]
+    if not words or words[0].startswith("--"):
+        if "ardupilot" not in words:
+            sys.argv += [f"--param={{name}}={{value}}" for name, value in QUICK_FLIGHT.items()]
+        if {{"--camera", "--camera-output"}} & {{*words}} and "--camera-rate" not in words:
+            sys.argv += ["--camera-rate", "5"]
+    main()
+"""
+
+
+def put_quick_programs(folder: Path) -> None:
+    """`companion` and `mavlink-sim`, with the same command line."""
+    folder.mkdir()
+    for name, text in (("companion", COMPANION), ("mavlink-sim", SIMULATOR)):
+        (folder / name).write_text(text)
+        (folder / name).chmod(0o755)
+
+
 def put_files(lines: Sequence[str], folder: Path, home: Path) -> None:
     """Write the files that the lines name."""
     for part, (name, put) in GIVEN.items():
