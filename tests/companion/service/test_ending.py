@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from companion.vehicle.state import LandedState
-from mavlink_sim.testing import running_simulator
+from mavlink_sim.testing import RunningSimulator, running_simulator
 from tests.companion.live_flight import LiveFlight
 from tests.companion.service_process import TWICE, ServiceProcess, running_service
 
@@ -53,6 +53,18 @@ def default_signals() -> Iterator[None]:
         signal.signal(number, handler)
 
 
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[RunningSimulator]:
+    """One for all ways: each finds it on the ground, or in the air where the one before has left it."""
+    with running_simulator(**TWICE) as running:
+        yield running
+
+
+def in_the_air(simulator: RunningSimulator) -> bool:
+    changes = [event for event in simulator.events if event.startswith(("takeoff", "disarmed"))]
+    return changes[-1:] == ["takeoff"]
+
+
 def end(service: ServiceProcess, way: str, terminal: int) -> None:
     if way == "terminal":
         os.close(terminal)
@@ -62,19 +74,23 @@ def end(service: ServiceProcess, way: str, terminal: int) -> None:
 
 
 @pytest.mark.parametrize("way", ["SIGINT", "SIGTERM", "SIGHUP", "SIGTERM SIGINT SIGHUP", "terminal"])
-def test_ending_in_flight_requests_hold(way: str, tmp_path: Path) -> None:
+def test_ending_in_flight_requests_hold(way: str, simulator: RunningSimulator, tmp_path: Path) -> None:
     terminal, console = pty.openpty()
     replies: list[dict[str, Any]] = []
-    with (
-        running_simulator(**TWICE) as simulator,
-        running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path, stdin=console) as service,
-    ):
+    with running_service(simulator.onboard_port, NO_CAMERA, cwd=tmp_path, stdin=console) as service:
         os.close(console)
-        service.take_off(2.0)
-        asking = threading.Thread(target=lambda: replies.append(service.command("goto 60 0")))
+        since = len(simulator.events)
+        if not in_the_air(simulator):
+            service.take_off(2.0)
+
+        def fly() -> None:
+            replies.append(service.command_when_it_can("goto forward=60 right=0"))
+
+        asking = threading.Thread(target=fly)
         asking.start()
-        simulator.wait_for_event("mode OFFBOARD")
-        offboard = simulator.events.index("mode OFFBOARD")
+        service.wait_for_line("command: goto")
+        simulator.wait_for_event("mode OFFBOARD", since=since)
+        offboard = simulator.events.index("mode OFFBOARD", since)
         end(service, way, terminal)
         assert service.process.wait(20) == 0
         simulator.wait_for_event("mode HOLD", since=offboard)
@@ -91,7 +107,7 @@ def test_ending_in_flight_requests_hold(way: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("arming", [True, False], ids=["arming", "armed"])
 async def test_ending_on_the_ground_disarms_what_it_armed(altitude_m: float, arming: bool) -> None:
     """PX4 would disarm by itself after COM_DISARM_PRFLT, 10 s."""
-    with running_simulator() as simulator:
+    with running_simulator(ready_after=0.0) as simulator:
         flight = LiveFlight("pymavlink", simulator.onboard_port)
         async with flight.running():
             await flight.until(lambda: flight.driver.state.ready_to_arm)
