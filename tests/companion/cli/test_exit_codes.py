@@ -14,7 +14,7 @@ import pytest
 
 from companion.host.passing import EXIT_PASSING
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import companion
+from tests.companion.command_line import companion, companion_here
 
 pytestmark = pytest.mark.realtime
 
@@ -43,6 +43,8 @@ def ports() -> Iterator[Ports]:
         yield Ports(tcp, udp, free_port(socket.SOCK_STREAM))
 
 
+# Refused before the command changes its process: in this one.
+AT_ONCE = ("view village.png", "view --dashboard-listen nonsense")
 # Command line, exit code, and what its last line names.
 CASES = [
     ("run --source none --zenoh-listen tcp/127.0.0.1:{tcp}", EXIT_PASSING, "{tcp}"),
@@ -76,7 +78,8 @@ def test_passing_failure_and_wrong_settings_differ(
         "here": tmp_path / "photos",
         "free": f"--zenoh-listen tcp/127.0.0.1:{ports.free} --dashboard-listen=",
     }
-    done = companion(*command.format(**words).split(), cwd=tmp_path)
+    run = companion_here if command.startswith(AT_ONCE) else companion
+    done = run(*command.format(**words).split(), cwd=tmp_path)
     assert done.returncode == code, done.stderr
     last = done.stderr.splitlines()[-1]
     assert last.startswith("companion: ")

@@ -315,7 +315,8 @@ async def test_cancelled_start_leaves_no_process(photos: Path, exported_model: P
     assert not alive(pid)
 
 
-async def test_failing_callback_is_reported(photos: Path) -> None:
+async def test_failing_callback_is_reported(photos: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.host.restarts.SOON_S", (0.2, 0.2))
     events: list[tuple[str, str]] = []
 
     def broken(_result: PerceptionResult) -> None:
