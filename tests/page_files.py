@@ -131,14 +131,15 @@ GIVEN = {
 }
 
 
-# As installed, but vehicles climb quickly, cameras have fewer images, and a service detects at half the size.
+# As installed, but vehicles climb quickly, cameras have fewer images, and a service detects at half the size
+# and serves no page, which dashboard.md does.
 COMPANION = f"""#!{sys.executable}
 import os, sys
 from companion import cli
 if __name__ == "__main__":
     command = sys.argv[1:2]
     if command in (["play"], ["run"]):
-        os.environ["COMPANION_DETECTOR_IMAGE_SIZE"] = "320"
+        os.environ.update(COMPANION_DETECTOR_IMAGE_SIZE="320", COMPANION_DASHBOARD_LISTEN="")
     if command == ["play"]:
         from companion.simulation import play, session
         from mavlink_sim.testing import QUICK_FLIGHT
