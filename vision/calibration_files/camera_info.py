@@ -215,8 +215,8 @@ def read_registration(file: str, orientation: Orientation) -> DepthCalibration:
     info.check_source(orientation)
     if info.registration is None:
         raise ValueError(
-            f"the calibration file {file} has no colour_from_depth: write it with companion calibrate "
-            f"extrinsics"
+            f"the calibration file {file} has no colour_from_depth: write it with companion calibrate lens "
+            "--depth-source"
         )
     return info.registration
 
