@@ -2,8 +2,11 @@
 
 import gc
 import os
-from collections.abc import Iterator
+import subprocess
+from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
@@ -46,6 +49,24 @@ def command_line_built_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("typer.testing._get_command", cache(typer.main.get_command))
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def trials_in_this_process() -> Iterator[Callable[..., Any]]:
+    """A model file is tried here and without limits: a process that imports torch takes two seconds.
+
+    Yields what runs the process, for the tests of the trial itself.
+    """
+    from vision.runtimes import load_trial
+
+    def run(runtime: str, path: Path) -> subprocess.CompletedProcess[bytes]:
+        return subprocess.CompletedProcess([runtime, path], load_trial.main(runtime, str(path)), b"", b"")
+
+    with pytest.MonkeyPatch.context() as patch:
+        run_apart = load_trial._run
+        patch.setattr(load_trial, "_run", run)
+        patch.setattr(load_trial, "_limit", lambda more_bytes, more_s: None)
+        yield run_apart
 
 
 @pytest.hookimpl(wrapper=True)

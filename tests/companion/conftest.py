@@ -56,13 +56,13 @@ def small_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(path: Path) -> None:
         import torch
 
+        from tests.vision.small_network import small_description
         from vision.detector import RENDERED_SCENES
-        from vision.training.published import yolov8_description
         from vision.yolo.architecture import build
         from vision.yolo.checkpoint import save_checkpoint
 
         torch.manual_seed(1)
-        model = build(yolov8_description((1 / 3, 0.0625, 256), ("person", "car", "boat"))).eval()
+        model = build(small_description(("person", "car", "boat"))).eval()
         trained_on = f"{RENDERED_SCENES}nobody"
         save_checkpoint(path, model, metadata={"licence": "Apache-2.0", "trained_on": trained_on})
 

@@ -21,7 +21,8 @@ from tests.vision.foreign_checkpoints import (
     save_foreign,
     trained_model,
 )
-from tests.vision.runtimes.conftest import make_image, needs, small_description
+from tests.vision.runtimes.conftest import make_image, needs
+from tests.vision.small_network import small_description
 from vision.detector import Detector
 from vision.exports.export import export
 from vision.foreign.layouts import TASKS

@@ -49,9 +49,7 @@ def check_load(path: Path, runtime: RuntimeName) -> None:
         marker = cache_folder() / f"{runtime}-{_digest(path, runtime)}.loads"
         if marker.exists():
             return
-        command = [sys.executable, "-m", "vision.runtimes.load_trial", runtime, str(path)]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        done = subprocess.run(command, capture_output=True, timeout=LOAD_S, check=False, env=environment)
+        done = _run(runtime, path)
     except subprocess.TimeoutExpired:
         raise _harmful(path, f"{runtime} has not loaded it within {LOAD_S:g} s") from None
     except OSError as error:
@@ -68,6 +66,13 @@ def check_load(path: Path, runtime: RuntimeName) -> None:
     with contextlib.suppress(OSError):  # it is tried again next time
         marker.parent.mkdir(parents=True, exist_ok=True)
         marker.touch()
+
+
+def _run(runtime: RuntimeName, path: Path) -> subprocess.CompletedProcess[bytes]:
+    """Run `main` in a process of its own."""
+    command = [sys.executable, "-m", "vision.runtimes.load_trial", runtime, str(path)]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    return subprocess.run(command, capture_output=True, timeout=LOAD_S, check=False, env=environment)
 
 
 def _harmful(path: Path, reason: str) -> RuntimeUnusableError:

@@ -28,7 +28,8 @@ from vision.calibration_files.camera_info import write_camera_info
 from vision.camera_model import CameraModel
 
 # Parameter → its readers: the arguments, with {} for the file, and the suffix that selects the reader.
-_DETECT = "detect {} --model small.onnx --limit 1"
+_DETECT = "detect {} --model none --limit 1"
+_TRAIN = "learn train --from small.pt --steps 1"
 _LENS = "calibrate lens {} --board chessboard 7x5 --square 0.03"
 _DEPTH_CAMERA = (
     "calibrate lens {source} --depth-source {depth_source} --board chessboard 7x5 --square 0.03 "
@@ -47,7 +48,7 @@ def _depth_camera(name: str) -> str:
 READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "detect source": (
         *((_DETECT, suffix) for suffix in _SOURCES),
-        ("detect {} --model none", ".mp4"),
+        ("detect {} --model small.onnx --limit 1", ".mp4"),
         ("detect {} --model none --depth", ".mp4"),
         ("detect {} --model none --cloud out.ply", ".mp4"),
         ("detect {} --model none --markers 4X4_50", ".mp4"),
@@ -62,8 +63,8 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "learn evaluate model": (("learn evaluate labelled --model {}", ".pt"),),
     "learn evaluate images": (("learn evaluate annotations.json --images {}", ".zip"),),
     "learn train start": (("learn train --data labelled --steps 1 --from {}", ".pt"),),
-    "learn train data": (("learn train --data {} --steps 1", ".yaml"),),
-    "learn train validation": (("learn train --data labelled --steps 1 --validation {}", ".yaml"),),
+    "learn train data": ((f"{_TRAIN} --data {{}}", ".yaml"),),
+    "learn train validation": ((f"{_TRAIN} --data labelled --validation {{}}", ".yaml"),),
     "models show file": (
         *(("models show {}", suffix) for suffix in _MODELS),
         ("models show {} --compare frame.png", ".pt"),

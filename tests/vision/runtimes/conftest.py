@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,28 +11,11 @@ import pytest
 import torch
 from torch import nn
 
-from vision.yolo.architecture import ModelDescription, YoloModel, build
+from tests.vision.small_network import small_description
+from vision.yolo.architecture import YoloModel, build
 from vision.yolo.checkpoint import save_checkpoint
 
-# Each kind of layer of YOLOv8 once, and a head at three levels.
-ROWS = [
-    [-1, 1, "Conv", [8, 3, 2]],
-    [-1, 1, "Conv", [8, 3, 2]],
-    [-1, 1, "Conv", [8, 3, 2]],
-    [-1, 1, "C2f", [8, True]],
-    [-1, 1, "Conv", [8, 3, 2]],
-    [-1, 1, "Conv", [8, 3, 2]],
-    [-1, 1, "SPPF", [8, 5]],
-    [-1, 1, "nn.Upsample", [None, 2, "nearest"]],
-    [[-1, 4], 1, "Concat", [1]],
-    [-1, 1, "C2f", [8]],
-]
-HEAD = [[[3, 9, 6], 1, "Detect", ["nc"]]]
 NAMES = ("person", "bicycle", "car", "dog", "boat", "chair")
-
-
-def small_description(names: Sequence[str]) -> ModelDescription:
-    return ModelDescription.from_plain({"backbone": ROWS, "head": HEAD}, names)
 
 
 def lively_model(seed: int = 0) -> YoloModel:

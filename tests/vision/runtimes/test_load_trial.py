@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,11 @@ pytest.importorskip("onnxruntime")
 
 
 @pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _in_a_process_with_a_new_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trials_in_this_process: Callable[..., Any]
+) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(load_trial, "_run", trials_in_this_process)
 
 
 def save(path: Path, nodes: list[object], functions: list[object], initializers: list[object]) -> Path:
