@@ -106,7 +106,7 @@ WALK: Walk = [
     ("models export", ("default", "--to", "onnx"), "models"),
     ("calibrate lens", ("none", "--board", "chessboard", "10x7", "--square", "0.02"), ENDS),
     ("calibrate mount", ("none", "--marker", "4X4_50"), ENDS),
-    ("bench detector", ("--frames", "5", "--image-size", "320"), ENDS),
+    ("bench detector", ("--frames", "5", "--image-size", "64"), ENDS),
     ("bench latency", ("--driver", "none"), ENDS),
     ("bench latency", ("--driver", "mavsdk", "--seconds", "1"), "service"),
     ("bench setpoints", ("--seconds", "1", "--load", "0"), ENDS),
@@ -119,7 +119,7 @@ SIMULATOR_WALK: Walk = [
         ("--vehicle-url", "udpin://127.0.0.1:0", "--camera-output", "rtp://127.0.0.1:5600"),
         "cameras",
     ),
-    ("dataset", ("images", "--frames", "2"), ENDS),
+    ("dataset", ("images", "--frames", "2", "--scene", "random", "--width", "64", "--height", "48"), ENDS),
     ("board", ("--help",), ENDS),
     ("bench", ("--help",), ENDS),
 ]
@@ -151,7 +151,7 @@ def walked(folder: Path, environment: dict[str, str], walk: Walk, module: str) -
     """
     packages = folder.parent / "packages"
     for name in ("companion", "mavlink_sim", "vision"):
-        shutil.copytree(ROOT / name, packages / name, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / name, packages / name)
     installed = files(packages)
     shutil.copy(ROOT / "docs/images/demo.png", folder)
     (folder / "labelled").mkdir()
