@@ -22,6 +22,7 @@ settings.load_profile("steady")
 
 # Tests run side by side: a thread pool of torch or OpenCV in each of them would only wait for the others'.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENCV_FOR_THREADS_NUM", "1")
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -77,8 +77,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def few(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first of the views, just enough for a calibration."""
-    path = tmp_path_factory.mktemp("few")
-    for image in sorted(folder.glob("*.png"))[:6]:
+    return first_views(folder, 6, tmp_path_factory.mktemp("few") / "views")
+
+
+def first_views(folder: Path, count: int, path: Path) -> Path:
+    """A folder at a path with the first of the views: a board that is not found takes long."""
+    path.mkdir()
+    for image in sorted(folder.glob("*.png"))[:count]:
         (path / image.name).symlink_to(image)
     return path
 
@@ -238,11 +243,12 @@ def test_live_cameras_are_paired_by_their_stamps() -> None:
         collect_views(Camera([0], board), BOARD, lambda _: None, 1, recorded)
 
 
-def test_no_board_in_any_view(few: Path, tmp_path: Path) -> None:
+def test_no_board_in_any_view(folder: Path, tmp_path: Path) -> None:
     words = ("--board", "chessboard", "8x5", "--square", "0.03")
-    line = one_line_of_bad_input(calibrate(few, *words, "-o", tmp_path / "camera.yaml"))
+    views = first_views(folder, 2, tmp_path / "views")
+    line = one_line_of_bad_input(calibrate(views, *words, "-o", tmp_path / "camera.yaml"))
     assert "no board " in line
-    assert " of 6 images" in line
+    assert " of 2 images" in line
     assert "8x5" in line
     assert not (tmp_path / "camera.yaml").exists()
 
@@ -285,25 +291,24 @@ def test_board_of_before_opencv_4_6_gives_a_calibration(legacy: Path, tmp_path: 
 def test_other_charuco_than_the_given_is_named(
     legacy: Path, words: tuple[str, ...], given: str, tmp_path: Path
 ) -> None:
-    line = one_line_of_bad_input(calibrate(legacy, *words, "-o", tmp_path / "camera.yaml"))
+    views = first_views(legacy, 3, tmp_path / "views")
+    line = one_line_of_bad_input(calibrate(views, *words, "-o", tmp_path / "camera.yaml"))
     assert "8 columns" in line
     assert "6 rows" in line
     assert "4X4" in line
     assert given in line
 
 
-def test_squares_given_as_inner_corners_are_named(few: Path, tmp_path: Path) -> None:
+def test_squares_given_as_inner_corners_are_named(folder: Path, tmp_path: Path) -> None:
     words = ("--board", "chessboard", "8x6", "--square", "0.03")
-    line = one_line_of_bad_input(calibrate(few, *words, "-o", tmp_path / "camera.yaml"))
+    views = first_views(folder, 2, tmp_path / "views")
+    line = one_line_of_bad_input(calibrate(views, *words, "-o", tmp_path / "camera.yaml"))
     assert "7x5 inner corners" in line
     assert "8x6 inner corners" in line
 
 
 def test_too_few_views(folder: Path, tmp_path: Path) -> None:
-    fewer = tmp_path / "fewer"
-    fewer.mkdir()
-    for number in range(5):
-        (fewer / f"{number}.png").symlink_to(folder / f"view{number:02d}.png")
+    fewer = first_views(folder, 5, tmp_path / "fewer")
     done = calibrate(fewer, *BOARD_WORDS, "-o", tmp_path / "camera.yaml")
     line = one_line_of_bad_input(done)
     assert done.stderr.splitlines() == [line]
