@@ -45,7 +45,7 @@ def main(warm_up: str, *paths: str) -> None:
     from vision.yolo.checkpoint import CheckpointError, load_checkpoint
 
     setattr(subprocess, "run", tried_in_a_copy)  # noqa: B010  # this process runs no other
-    load_trial.CHECKPOINT_S = 2
+    load_trial.CHECKPOINT_S = 1
     # Memory of torch's first use is not counted.
     load_checkpoint(warm_up)
     # Collecting torch's own objects for every file takes most of the time.
