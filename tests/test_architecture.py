@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -218,6 +219,14 @@ def imports_of(name: str, path: Path) -> frozenset[str]:
     return frozenset(module for module in found if module in known and module != name)
 
 
+def trees_with(words: str, *packages: str) -> Iterator[tuple[str, ast.AST]]:
+    """Name and syntax tree of the files that have one of these words: to parse all takes seconds."""
+    for package in packages:
+        for path in (ROOT / package).rglob("*.py"):
+            if re.search(words, text := path.read_text()):
+                yield path.relative_to(ROOT).as_posix(), ast.parse(text)
+
+
 def circles(package: str) -> set[frozenset[str]]:
     """The sets of modules of a package that import each other (Tarjan's strongly connected components)."""
     graph = {name: imports_of(name, path) for name, path in modules().items() if name.startswith(package)}
@@ -421,14 +430,10 @@ def _behaviour_calls(tree: ast.AST) -> list[tuple[bool, str]]:
 def test_only_guidance_steps_a_behaviour() -> None:
     """Whoever flies one goes through `Guidance.step`; unit tests of single updates do not loop."""
     callers = {}
-    for folder in ("companion", "benchmarks", "examples", "tests", "tools"):
-        for path in (ROOT / folder).rglob("*.py"):
-            text = path.read_text()
-            # Few files have such a call; to parse all takes seconds.
-            if not (".update(" in text or ".on_activate(" in text):
-                continue
-            if calls := _behaviour_calls(ast.parse(text)):
-                callers[path.relative_to(ROOT).as_posix()] = calls
+    folders = ("companion", "benchmarks", "examples", "tests", "tools")
+    for name, tree in trees_with(r"\.(update|on_activate)\(", *folders):
+        if calls := _behaviour_calls(tree):
+            callers[name] = calls
     for name in STEPS_BEHAVIOURS:
         assert callers.pop(name), name
     callers = {name: calls for name, calls in callers.items() if not name.startswith(COMPOSED_BEHAVIOURS)}
@@ -489,11 +494,10 @@ def test_every_part_is_in_the_document(package: str) -> None:
 
 def test_an_assert_only_narrows_a_type() -> None:
     """`python -O` removes it, so it must not check what may come: only what the code itself has made sure."""
-    for package in ("companion", "vision", "mavlink_sim"):
-        for path in (ROOT / package).rglob("*.py"):
-            for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Assert):
-                    assert _narrows(node.test), f"{path.relative_to(ROOT)}:{node.lineno}"
+    for name, tree in trees_with(r"\bassert\b", "companion", "vision", "mavlink_sim"):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Assert):
+                assert _narrows(node.test), f"{name}:{node.lineno}"
 
 
 def _narrows(test: ast.expr) -> bool:
@@ -508,10 +512,10 @@ def _narrows(test: ast.expr) -> bool:
 def test_no_background_task_ends_unseen() -> None:
     starts = {"create_task", "ensure_future"}
     found = set()
-    for path in (ROOT / "companion").rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+    for name, tree in trees_with("|".join(starts), "companion"):
+        for node in ast.walk(tree):
             if isinstance(node, ast.Attribute) and node.attr in starts:
-                found.add(str(path.relative_to(ROOT)))
+                found.add(name)
     assert found == AWAITED_TASKS
 
 
@@ -546,10 +550,9 @@ def _unbounded_copies(tree: ast.AST) -> list[int]:
 def test_only_one_function_copies_what_a_peer_sent() -> None:
     """`companion.host.peer_data.copy_payload` checks the size first; `vision` does not know zenoh."""
     found = {}
-    for package in ("companion", "mavlink_sim"):
-        for path in (ROOT / package).rglob("*.py"):
-            if lines := _unbounded_copies(ast.parse(path.read_text())):
-                found[path.relative_to(ROOT).as_posix()] = len(lines)
+    for name, tree in trees_with("to_bytes|to_string|payload|attachment", "companion", "mavlink_sim"):
+        if lines := _unbounded_copies(tree):
+            found[name] = len(lines)
     assert found == COPIES_OF_PAYLOADS
 
 

@@ -96,7 +96,10 @@ def as_published(each: TrackedObject) -> dict[str, Any]:
     return {key: list(value) if isinstance(value, tuple) else value for key, value in values.items()}
 
 
-@pytest.mark.parametrize("command", ["approach car", "follow car", "orbit car radius=8"])
+@pytest.mark.parametrize(
+    "command",
+    ["approach car", *(pytest.param(each, marks=pytest.mark.slow) for each in ("follow car", "orbit car radius=8"))],
+)
 def test_object_is_the_same_value_everywhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
