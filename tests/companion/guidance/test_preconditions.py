@@ -144,7 +144,10 @@ def planned(harness: GuidanceHarness, *steps: str, on_failure: str = "rtl") -> S
 def started(made: World, *steps: str, on_failure: str = "rtl") -> Pending:
     harness = made.harness
     pending = harness.command(planned(harness, *steps, on_failure=on_failure))
-    harness.run(6.0)  # longer than a command waits for a gimbal
+    ends_ns = harness.now_ns + 6_000_000_000  # longer than a command waits for a gimbal
+    while harness.now_ns < ends_ns and not pending.done():
+        harness.run(0.1)
+    harness.run(0.5)  # what is refused requests nothing later either
     return pending
 
 
