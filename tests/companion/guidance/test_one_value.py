@@ -98,7 +98,10 @@ def as_published(each: TrackedObject) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     "command",
-    ["approach car", *(pytest.param(each, marks=pytest.mark.slow) for each in ("follow car", "orbit car radius=8"))],
+    [
+        "approach car",
+        *(pytest.param(each, marks=pytest.mark.slow) for each in ("follow car", "orbit car radius=8")),
+    ],
 )
 def test_object_is_the_same_value_everywhere(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
