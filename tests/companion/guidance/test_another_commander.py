@@ -138,9 +138,7 @@ FLIGHT = (
 )
 
 
-@pytest.mark.parametrize(
-    "autopilot", ["1.14", pytest.param("1.16", marks=pytest.mark.slow), "1.18", "ardupilot"]
-)
+@pytest.mark.parametrize("autopilot", ["1.14", "1.16", "1.18", "ardupilot"])
 def test_no_phase_of_a_flight_alone_is_another_commander(autopilot: str) -> None:
     options = {"autopilot": "ardupilot"} if autopilot == "ardupilot" else {"px4": autopilot}
     rates_hz = {name: hz for name, hz in RATES_HZ.items() if autopilot != "1.14" or name != "CURRENT_MODE"}

@@ -118,7 +118,7 @@ def test_a_file_that_is_no_network_is_named(tmp_path: Path, content: bytes) -> N
 
 
 # `test_checkpoint_fuzz` reads all of them, with the same limits.
-@pytest.mark.parametrize("name", ["lists", pytest.param("a tensor of a large size", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["lists", "a tensor of a large size"])
 def test_checkpoint_that_takes_much_memory_is_refused(tmp_path: Path, name: str) -> None:
     path = BOMBS[name][0](tmp_path / "bomb.pt")
     with pytest.raises(CheckpointError, match=r"3\d MiB") as caught:
