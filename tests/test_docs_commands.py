@@ -35,7 +35,6 @@ NOT_RUN = {
     "/dev/video": "a camera",
     "/dev/v4l/": "a camera",
     "csi://0": "a camera",
-    "ros://": "a camera of ROS 2",
     "companion calibrate photos": "photographs of a printed board",
     "companion calibrate colour": "images of two cameras",
     "companion detect images/": "photographs of a marker",
