@@ -43,14 +43,14 @@ def node(
     def say(line: str) -> None:
         print(with_load(line), flush=True)
 
-    async def run() -> None:
+    async def run(found: str) -> None:
         ended = asyncio.Event()
         _watch = on_ending(ended.set)
-        await run_node(settings, find_python(python), ros_arguments or (), ended, say)
+        await run_node(settings, found, ros_arguments or (), ended, say)
 
     if ros_arguments and ros_arguments[0] != "--ros-args":
         refuse(f"{ros_arguments[0]!r}: expected --ros-args after --")
     with plain_errors(NoAnswerError, BusError, Ros2Error, SourceError, code=EXIT_BAD_INPUT):
-        asyncio.run(run())
+        asyncio.run(run(find_python(python)))
     sys.stdout.flush()
     os._exit(0)  # a thread of zenoh that calls back while Python ends would abort it

@@ -23,6 +23,8 @@ from companion.settings import Settings, ZenohSection
 _STATUS_AGE_NS = 2_000_000_000
 _THIS_HOST = re.compile(r"/(127\.|localhost|\[::1\])")
 _WARN_INTERVAL_S = 10.0
+# Of a text or a velocity.
+LARGEST_REQUEST_BYTES = 64 * 1024
 _STAMPS_KEPT = 512  # of some seconds: images come after their detections
 
 
@@ -46,8 +48,10 @@ class NodeTopic:
     Attributes:
         name: relative to the namespace, absolute, or of the node, as `~/result`.
         latched: transient local.
-        reliable: else best effort. A subscription that is not reliable accepts all publishers; it becomes
-            reliable where all are.
+        reliable: else best effort. A subscription that is not reliable accepts all publishers.
+        adapts: this subscription becomes reliable where all publishers are: large images need it. A velocity
+            must not: after a gap of the network old ones would be sent again.
+        largest_bytes: a larger message that is received is left out, before it is copied.
     """
 
     name: str
@@ -56,6 +60,8 @@ class NodeTopic:
     reliable: bool = True
     latched: bool = False
     depth: int = 10
+    adapts: bool = False
+    largest_bytes: int = LARGEST_REQUEST_BYTES
 
     @staticmethod
     def made_of(topic: RosTopic, camera: str | None) -> NodeTopic:

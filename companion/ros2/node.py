@@ -33,6 +33,7 @@ CLOCK_BODY = struct.Struct("<qq?")  # as `RECEIVED`, and whether ROS time is sim
 TOPICS, MESSAGE, WANTED, READY, CLOCK = range(1, 6)
 EXIT_REFUSED = 2  # it has printed why it cannot work
 _PERIOD_S = 0.2
+_REPORT_S = 10.0
 _SAME_MOMENT_NS, _MOST_READINGS = 200_000, 5
 
 
@@ -47,6 +48,7 @@ class _Bridge:
         self._node, self._parent, self._lock = node, parent, threading.Lock()
         self._publishers: dict[int, Any] = {}
         self._adapted: dict[int, tuple[dict[str, Any], Any]] = {}  # topic and subscription
+        self._large: dict[str, float] = {}  # topic and when its last message that is too large was reported
         self._wanted: set[int] = set()
         self._namesake_checks = int(namesake_s / _PERIOD_S)
 
@@ -111,6 +113,12 @@ class _Bridge:
                 full = self._node.get_fully_qualified_name()
                 _say(f"another node is {full}, and both answer: change ros2.namespace of one, or end it")
 
+    def _leave_out(self, name: str, size: int, largest: int) -> None:
+        now_s = time.monotonic()
+        if now_s - self._large.get(name, -_REPORT_S) >= _REPORT_S:
+            self._large[name] = now_s
+            _say(f"{name}: messages left out: {size} bytes, at most {largest} are received")
+
     def _add(self, topics: list[dict[str, Any]]) -> None:
         missing: dict[str, list[str]] = {}
         for topic in topics:
@@ -137,13 +145,16 @@ class _Bridge:
         )
 
         def receive(payload: bytes) -> None:
+            if len(payload) > topic["largest_bytes"]:
+                self._leave_out(name, len(payload), topic["largest_bytes"])
+                return
             self.send(MESSAGE, channel, RECEIVED.pack(*self._now()), payload)
 
         if topic["publish"]:
             self._publishers[channel] = self._node.create_publisher(kind, name, profile)
             return
         subscription = self._node.create_subscription(kind, name, receive, profile, raw=True)
-        if not topic["reliable"] or channel in self._adapted:
+        if topic["adapts"]:
             self._adapted[channel] = topic, subscription
 
 

@@ -14,12 +14,13 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from pathlib import Path
-from threading import RLock, Thread
+from threading import Lock, RLock, Thread
 from typing import Any
 
 import zenoh
 
 from companion.bus.client import NoAnswerError, client_settings, open_client
+from companion.bus.topics import LARGEST_BINARY_BYTES
 from companion.host.child_process import supervised
 from companion.ros2 import node as protocol
 from companion.ros2.gateway import (
@@ -43,6 +44,7 @@ _PROBE_S = 30.0
 # One that was killed is listed by the others for up to 20 s (the lease of DDS).
 NAMESAKE_S = 25.0
 _RETRY_S, _END_S = 2.0, 5.0
+_OF_NODE = ("name", "reliable", "latched", "depth", "adapts", "largest_bytes")
 
 
 class Ros2Error(RuntimeError):
@@ -86,7 +88,7 @@ def node_command(python: str, name: str, namespace: str, arguments: Sequence[str
 
 def _described(topic: NodeTopic, channel: int) -> dict[str, Any]:
     """Return what the node reads of a topic."""
-    about = {name: getattr(topic, name) for name in ("name", "reliable", "latched", "depth")}
+    about = {name: getattr(topic, name) for name in _OF_NODE}
     return {**about, "channel": channel, "type": topic.type_name, "publish": topic.on_serialized is None}
 
 
@@ -119,6 +121,8 @@ class RosNode:
         self._wanted: set[int] = set()
         self._socket: socket.socket | None = None
         self._lock, self._losses = RLock(), Losses(say)
+        # Held while topics of the bus begin and end, which waits for functions that may need the other lock.
+        self._wanting = Lock()
 
     async def start(self) -> tuple[Process, Callable[[], None]]:
         """Start the process, for `supervised`."""
@@ -163,9 +167,10 @@ class RosNode:
         self.declare(*made)
         for topic, to_publish in zip(topics, made, strict=True):
             channel = self._channels[to_publish.name]
-            self._outputs.setdefault(channel, []).append((topic, camera))
-            if topic.latched or channel in self._wanted:
-                self._on_wanted(topic, camera, True)
+            with self._wanting:
+                self._outputs.setdefault(channel, []).append((topic, camera))
+                if topic.latched or channel in self._wanted:
+                    self._on_wanted(topic, camera, True)
 
     def declare(self, *topics: NodeTopic) -> None:
         """Publish topics, or subscribe to them. One that is declared already stays as it is."""
@@ -215,6 +220,8 @@ class RosNode:
         except OSError:
             pass
         with self._lock:
+            if self._socket is not ours:
+                return  # the next process is there already
             self._socket = None
         for channel in tuple(self._wanted):
             self._set_wanted(channel, False)
@@ -236,10 +243,11 @@ class RosNode:
             self._on_ready(about["name"], about["namespace"].strip("/"))
 
     def _set_wanted(self, channel: int, wanted: bool) -> None:
-        (self._wanted.add if wanted else self._wanted.discard)(channel)
-        for topic, camera in self._outputs.get(channel, ()):
-            if not topic.latched:
-                self._on_wanted(topic, camera, wanted)
+        with self._wanting:
+            (self._wanted.add if wanted else self._wanted.discard)(channel)
+            for topic, camera in self._outputs.get(channel, ()):
+                if not topic.latched:
+                    self._on_wanted(topic, camera, wanted)
 
 
 def _shut(connection: socket.socket) -> None:
@@ -316,7 +324,12 @@ async def run_node(
 
         images = {topic: kind for camera in cameras for topic, kind in camera.topics.items()}
         node.declare(
-            *(NodeTopic(topic, kind, on_image, reliable=False, depth=2) for topic, kind in images.items())
+            *(
+                NodeTopic(
+                    topic, kind, on_image, False, depth=2, adapts=True, largest_bytes=LARGEST_BINARY_BYTES
+                )
+                for topic, kind in images.items()
+            )
         )
         for camera in cameras:
             stack.callback(camera.close)

@@ -21,6 +21,8 @@ from companion.ros2.gateway import NodeTopic
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 _CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
+_REPEATED_NS = 10_000_000_000
+_SHOWN = 200  # characters of a command in its outcome
 # A mission takes so long.
 _TIMEOUT_S = 3600.0
 # A newer command ends the one before, so more than a few do not wait for their outcome at once.
@@ -50,6 +52,7 @@ class Requests:
         self._session, self._vehicle, self._commands = session, vehicle, commands
         self._publish_result, self._say = publish_result, say
         self._source = f"ros2-{secrets.token_hex(4)}"
+        say(f"cmd_vel: steers under the command: velocity source={self._source}")
         self._velocities = session.declare_publisher(
             VELOCITY.key(vehicle),
             encoding=VELOCITY.encoding,
@@ -58,7 +61,7 @@ class Requests:
             express=VELOCITY.express,
         )
         self._lock, self._running = Lock(), 0
-        self._object = ""  # that is sought now
+        self._object, self._object_ns = "", 0  # the newest that was received, and when
         self._request = 0
 
     def topics(self) -> tuple[NodeTopic, ...]:
@@ -86,16 +89,21 @@ class Requests:
         }
         self._velocities.put(json.dumps(body))
 
-    def on_object(self, name: str, type_name: str, payload: memoryview, *_: int) -> None:
-        """Process the name of a class: `seek` it, then `approach` it. The same again changes nothing."""
+    def on_object(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+        """Process the name of a class: `seek` it, then `approach` it.
+
+        A publisher may repeat it without end. So the same again within `_REPEATED_NS` is no new request, also
+        after another command or the pilot has ended the flight; an empty text ends the repetition.
+        """
         wanted = str(decode(type_name, payload)["data"]).strip()
-        if not _CLASS_NAME.fullmatch(wanted):
+        if wanted and not _CLASS_NAME.fullmatch(wanted):
             self._answer(wanted, {"success": False, "reason": f"{name}: expected the name of a class"})
             return
         with self._lock:
-            if wanted == self._object:
+            repeated = wanted == self._object and received_ns - self._object_ns < _REPEATED_NS
+            self._object, self._object_ns = wanted, received_ns
+            if repeated or not wanted:
                 return
-            self._object = wanted
             self._request += 1
             request = self._request
         self._start(wanted, partial(self._seek_and_go, wanted, request))
@@ -113,7 +121,6 @@ class Requests:
             if not refused:
                 self._running += 1
         if refused:
-            self._object = ""
             self._answer(text, {"success": False, "reason": refused})
             return
 
@@ -130,9 +137,6 @@ class Requests:
         found = self._execute(f'seek "{wanted}"')
         if found and request == self._request:
             self._execute(f'approach "{wanted}"')
-        with self._lock:
-            if request == self._request:
-                self._object = ""
 
     def _execute(self, text: str) -> bool:
         """Send a command, and publish its outcome. Returns whether it has succeeded."""
@@ -146,4 +150,4 @@ class Requests:
         return bool(reply.get("success"))
 
     def _answer(self, text: str, reply: dict[str, Any]) -> None:
-        self._publish_result(encode(STRING, {"data": json.dumps({"command": text, **reply})}))
+        self._publish_result(encode(STRING, {"data": json.dumps({"command": text[:_SHOWN], **reply})}))

@@ -192,7 +192,7 @@ def text_of(text: str) -> memoryview:
 
 
 @pytest.mark.realtime
-@pytest.mark.parametrize("name", ["", 'car" distance=0', "car\nland", "x" * 65])
+@pytest.mark.parametrize("name", ['car" distance=0', "car\nland", "x" * 65])
 def test_object_that_is_no_name_of_a_class_is_refused(name: str, bus: BusSide, requests: Any) -> None:
     made, results = requests
     made.on_object("object_to_seek", STRING, text_of(name), 0, 0)
@@ -207,8 +207,24 @@ def test_object_that_is_not_found_is_not_approached(bus: BusSide, requests: Any)
     made.on_object("object_to_seek", STRING, text_of("car"), 0, 0)
     assert results.get(timeout=WAIT_S)["reason"] == "not found"
     assert bus.commands.get(timeout=WAIT_S) == 'seek "car"'
-    wait_until(lambda: made._object == "")
     assert bus.commands.empty()
+
+
+@pytest.mark.realtime
+def test_repeated_object_does_not_take_the_vehicle_back(bus: BusSide, requests: Any) -> None:
+    """A publisher repeats it at 1 Hz; meanwhile the pilot or another command has ended the search."""
+    made, results = requests
+    bus.reply = {"success": False, "reason": "the pilot took over: hold mode"}
+    for second in range(30):
+        made.on_object("object_to_seek", STRING, text_of("car"), second * 10**9, 0)
+        if second == 0:
+            assert results.get(timeout=WAIT_S)["success"] is False
+    assert [bus.commands.get(timeout=WAIT_S), bus.received] == ['seek "car"', 1]
+    made.on_object("object_to_seek", STRING, text_of(""), 30 * 10**9, 0)  # the end of the repetition
+    made.on_object("object_to_seek", STRING, text_of("car"), 31 * 10**9, 0)
+    assert bus.commands.get(timeout=WAIT_S) == 'seek "car"'
+    made.on_object("object_to_seek", STRING, text_of("car"), 42 * 10**9, 0)  # a silence of 11 s
+    assert bus.commands.get(timeout=WAIT_S) == 'seek "car"'
 
 
 @pytest.mark.realtime

@@ -213,6 +213,16 @@ def test_twist_becomes_a_velocity_and_nan_is_left_out(ros: str, bus: BusSide) ->
 
 
 @pytest.mark.parametrize("ros", JAZZY)
+def test_command_of_100_kb_is_left_out_with_its_size(ros: str, bus: BusSide) -> None:
+    with running_node(ros, bus.endpoint) as node, ros_peer(ros) as peer:
+        peer.publish("/drone1/companion/command", STRING, {"data": "x" * 100_000})
+        line = node.wait_for_line("left out")
+    assert "~/command" in line
+    assert "65536" in line
+    assert bus.commands.empty()
+
+
+@pytest.mark.parametrize("ros", JAZZY)
 def test_stamps_are_of_simulated_time_while_there_is_one(ros: str, bus: BusSide) -> None:
     with (
         running_node(ros, bus.endpoint, "--", "--ros-args", "-p", "use_sim_time:=true"),
@@ -382,7 +392,7 @@ def test_raw_images_of_900_kb_reach_the_parent_at_30_hz(ros: str, domain: int) -
         say=print,
     )
     image = "sensor_msgs/msg/Image"
-    node.declare(NodeTopic("camera/image_raw", image, on_serialized, reliable=False, depth=2))
+    node.declare(NodeTopic("camera/image_raw", image, on_serialized, False, False, 2, True, 2**24))
 
     async def until_received() -> None:
         async with supervised("node", node.start, print):
