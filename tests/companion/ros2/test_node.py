@@ -200,14 +200,14 @@ def test_twist_becomes_a_velocity_and_nan_is_left_out(ros: str, bus: BusSide) ->
 
     subscriber = bus.session.declare_subscriber(VELOCITY.key(VEHICLE), on_velocity)
     with running_node(ros, bus.endpoint) as node, ros_peer(ros) as peer:
-        peer.publish("/drone1/cmd_vel", TWIST, {"linear": {"x": float("nan")}})
-        node.wait_for_line("cmd_vel")
+        peer.publish("/drone1/cmd_vel", TWIST, {"linear": {"x": float("nan")}}, times=20, hz=10)
+        node.wait_for_line("finite")
         assert received == []
         moves = {"linear": {"x": 1.0, "y": 2.0, "z": 3.0}, "angular": {"z": 0.5}}
-        peer.publish("/drone1/cmd_vel", TWIST, moves)
+        peer.publish("/drone1/cmd_vel", TWIST, moves, times=20, hz=10)
         assert arrived.wait(WAIT_S)
     subscriber.undeclare()  # type: ignore[no-untyped-call]
-    (velocity,) = received
+    velocity = received[0]
     names = ("forward_mps", "right_mps", "up_mps", "turn_radps")
     assert [velocity[name] for name in names] == [1.0, -2.0, 3.0, -0.5]
 
