@@ -39,6 +39,7 @@ _JPEG_LOOK_AHEAD = bytes(9)
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 _TIFF = {b"II*\0": "little", b"MM\0*": "big"}
 _SUBFILE_TYPE, _NO_PAGE = 254, 1 | 4  # TIFF 6.0: reduced images and masks
+_WIDTHS, _HEIGHTS = (256, 322), (257, 323)  # TIFF 6.0: of the image and of a tile
 
 
 class ImageError(ValueError):
@@ -115,6 +116,23 @@ def decode_image(data: bytes) -> NDArray[np.uint8] | None:
         return None
 
 
+def stated_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height in the header of a JPEG, PNG or TIFF, pixels: what decoding would allocate.
+
+    Of a TIFF whose tiles are larger it is that of a tile. None: another file, or one without such a header.
+    """
+    if data.startswith(_PNG):
+        return _png_size(data) if data[12:16] == b"IHDR" else None
+    if data.startswith(b"\xff\xd8"):
+        at = _jpeg_frame(data)
+        if at is None or len(data) < at + 7:
+            return None
+        return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 3 : at + 5], "big")
+    if order := _TIFF.get(data[:4]):
+        return _tiff_size(data, order)
+    return None
+
+
 def decode(data: bytes) -> DecodedImage:
     """Decode an image file. A JPEG or PNG that lacks nothing but its end is whole.
 
@@ -189,13 +207,29 @@ def _whole_jpeg(data: bytes) -> tuple[bytes, str]:
 
 
 def _is_progressive(data: bytes) -> bool:
-    """By the frame header (ITU-T T.81, B.2.2)."""
+    at = _jpeg_frame(data)
+    return at is not None and data[at - 1] == 0xC2
+
+
+def _jpeg_frame(data: bytes) -> int | None:
+    """Where the frame header is, behind its marker (ITU-T T.81, B.2.2); None: nowhere before a scan.
+
+    Bytes between segments are skipped, as libjpeg does: else it would decode another size than is found here.
+    """
     at = 2
-    while len(data) >= at + 4 and data[at] == 0xFF and data[at + 1] != 0xDA:
-        if data[at + 1] == 0xC2:
-            return True
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return False
+    while 0 <= (at := data.find(b"\xff", at)) < len(data) - 1:
+        at, code = at + 1, data[at + 1]
+        if code == 0xFF:  # fill
+            continue
+        at += 1
+        if code in (0x00, 0x01) or 0xD0 <= code <= 0xD7:  # without a segment
+            continue
+        if 0xC0 <= code <= 0xCF and code not in (0xC4, 0xCC):  # tables have those
+            return at
+        if code in (0xD8, 0xD9, 0xDA):
+            return None
+        at += int.from_bytes(data[at : at + 2], "big")
+    return None
 
 
 def _unreadable(data: bytes, image: NDArray[Any] | None) -> str:
@@ -256,3 +290,17 @@ def _pages(data: bytes, order: Any) -> int:
         pages += not kind & _NO_PAGE
         at = number(at + 2 + 12 * entries, 4)
     return pages
+
+
+def _tiff_size(data: bytes, order: Any) -> tuple[int, int] | None:
+    first = int.from_bytes(data[4:8], order)
+    stated: dict[int, int] = {}
+    for at in range(first + 2, first + 2 + 12 * int.from_bytes(data[first : first + 2], order), 12):
+        tag, kind = (int.from_bytes(data[start : start + 2], order) for start in (at, at + 2))
+        if tag in _WIDTHS + _HEIGHTS:
+            value = data[at + 8 : at + (10 if kind == 3 else 12)]  # 16 or 32 bits
+            stated[tag] = max(stated.get(tag, 0), int.from_bytes(value, order))
+    if not {_WIDTHS[0], _HEIGHTS[0]}.issubset(stated):
+        return None
+    width, height = (max(stated.get(tag, 0) for tag in tags) for tags in (_WIDTHS, _HEIGHTS))
+    return width, height

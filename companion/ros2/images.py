@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from companion.ros2 import cdr
 from vision.calibration_files.lens_names import distortion_name
 from vision.camera_model import CameraCalibration, CameraModel, scaled_to_frames
-from vision.image_file import decode, frame_pixels
+from vision.image_file import decode, frame_pixels, stated_size
 from vision.shared_frame import SharedFrameWriter
 from vision.sources.depth_images import FLOAT_SCALE_M, INTEGER_SCALE_M, decode_depth, to_metres
 from vision.sources.ros import SCHEME, RosAddress, parse_ros_address
@@ -50,6 +50,8 @@ _DEEP = {"mono16": "u2", "16UC1": "u2", "32FC1": "f4"}
 _DEPTH = ("16UC1", "32FC1")
 _COMPRESSED_DEPTH_HEADER = 12  # bytes, compression_common.h: only 32FC1 needs it
 
+# A larger image is refused before it is decoded: a PNG of 1 MB can need gigabytes.
+_MOST_PIXELS = 1 << 25
 _OLDEST_NS = 60_000_000_000  # an older stamp is of another clock; a newer one may be of a slow network
 _AHEAD_NS = 50_000_000  # drivers' clocks and the steps of /clock run ahead so far
 _RETRY_NS = 1_000_000_000  # of a shared memory that cannot be created
@@ -254,6 +256,7 @@ def _raw(message: Mapping[str, Any]) -> _Image:
     if not pixel_bytes:
         known = ", ".join((*_COLOUR, *_DEEP))
         raise _UnknownEncodingError(f"the encoding {encoding[:40]!r} is not read, only {known}")
+    _check_size(width, height)
     channels = () if pixel_bytes == item.itemsize else (pixel_bytes,)
     least = (width + width % 2 if channels == (2,) else width) * pixel_bytes  # 4:2:2 has pairs of pixels
     if width == 0 or height == 0 or step < least or len(data) != step * height:
@@ -267,19 +270,29 @@ def _raw(message: Mapping[str, Any]) -> _Image:
 
 
 def _compressed(message: Mapping[str, Any]) -> _Image:
-    """The image of compressed_image_transport or compressed_depth_image_transport."""
-    kind, data = message["format"], message["data"]
+    """The image of compressed_image_transport (JPEG, PNG, TIFF) or compressed_depth_image_transport."""
+    kind, data = message["format"], bytes(message["data"])
     encoding, _, method = (part.strip() for part in kind.partition(";"))
     if method.startswith("compressedDepth"):
         if encoding != "16UC1" or method not in ("compressedDepth", "compressedDepth png"):
             raise _UnknownEncodingError(f"the format {kind[:60]!r} is not read: 16UC1 as PNG is")
         data = data[_COMPRESSED_DEPTH_HEADER:]
-    elif encoding not in _DEPTH:
-        return decode(bytes(data)).pixels, None, False
-    image = decode_depth(Path("its image"), bytes(data))
+    if (size := stated_size(data)) is None:
+        raise ValueError("its image is no JPEG, PNG or TIFF with a size in its header")
+    _check_size(*size)
+    if encoding not in _DEPTH:
+        return decode(data).pixels, None, False
+    image = decode_depth(Path("its image"), data)
     if image is None:
         raise ValueError("its depth image is damaged")
     return image, None, True
+
+
+def _check_size(width: int, height: int) -> None:
+    if width * height > _MOST_PIXELS:
+        raise ValueError(
+            f"its image has {width}x{height} pixels, more than {_MOST_PIXELS}; publish it smaller"
+        )
 
 
 def lens_of(message: Mapping[str, Any], rectified: bool = False) -> CameraModel:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from vision.evaluation.datasets import DatasetError, image_files
 from vision.evaluation.datasets import read_image as read_labelled
 from vision.exports.quantize import FEWEST_IMAGES, calibration_images
-from vision.image_file import ImageError, decode, decode_image, read_image
+from vision.image_file import ImageError, decode, decode_image, read_image, stated_size
 from vision.sources import SourceError, open_source
 
 GREY = np.tile(np.linspace(0, 255, 64).round().astype(np.uint8), (48, 1))
@@ -152,6 +152,46 @@ def test_unreadable_image_has_a_reason(name: str, capfd: pytest.CaptureFixture[s
     assert "\n" not in str(raised.value)
     assert decode_image(data) is None
     assert capfd.readouterr().err == ""
+
+
+def with_tiles(width: int, height: int) -> bytes:
+    """A TIFF of 1x1 pixels with such tiles."""
+    fields = [(256, 3, 1), (257, 3, 1), (322, 4, width), (323, 4, height)]
+    data = b"MM\0*" + struct.pack(">IH", 8, len(fields))
+    for tag, kind, value in fields:
+        data += struct.pack(">HHI", tag, kind, 1) + struct.pack(
+            ">HH" if kind == 3 else ">I", value, *[0] * (kind == 3)
+        )
+    return data
+
+
+FIRST = CUT_JPEG[:2]
+SIZES: dict[str, tuple[bytes, tuple[int, int] | None]] = {
+    "PNG": (png(16000, 15000), (16000, 15000)),
+    "JPEG": (CUT_JPEG, (640, 480)),
+    "progressive": (encoded(LARGE, ".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1), (640, 480)),
+    "JPEG turned by EXIF": (turned(CUT_JPEG, 6), (640, 480)),
+    "JPEG with fill bytes": (FIRST + b"\xff\xff" + CUT_JPEG[2:], (640, 480)),
+    "JPEG with bytes between": (FIRST + b"\0\1\xff\0\xff\xd0" + CUT_JPEG[2:], (640, 480)),
+    "JPEG with a frame in a comment": (
+        FIRST + b"\xff\xfe\0\x0b\xff\xc0" + bytes(7) + CUT_JPEG[2:],
+        (640, 480),
+    ),
+    "JPEG cut off": (CUT_JPEG[:100], None),
+    "JPEG that begins with its end": (FIRST + b"\xff\xd9" + CUT_JPEG[2:], None),
+    "TIFF": (encoded(COUNTS, ".tiff"), (64, 48)),
+    "pages": (multi_page(0, 3), (1, 1)),
+    "TIFF of large tiles": (with_tiles(30000, 20000), (30000, 20000)),
+    "TIFF cut off": (b"II*\0", None),
+    "bmp": (encoded(COLOUR, ".bmp"), None),
+    "nothing": (b"", None),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_size_is_known_before_decoding(name: str) -> None:
+    data, expected = SIZES[name]
+    assert stated_size(data) == expected
 
 
 def test_dead_and_hot_pixels_do_not_set_the_range() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 import struct
+import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -312,6 +313,40 @@ def test_damaged_jpeg_is_counted(camera: Camera) -> None:
     camera.send(compressed("jpeg", data[: len(data) // 2]), COMPRESSED)
     assert camera.frame() is None
     assert camera.ros.problems == {"message": 1}
+
+
+def bomb() -> bytes:
+    """A PNG of 16000x16000 pixels, 31 kB."""
+    header = struct.pack(">IIBBBBB", 16000, 16000, 1, 0, 0, 0, 0)
+    rows = zlib.compress(bytes(2001 * 16000))
+    parts = ((b"IHDR", header), (b"IDAT", rows), (b"IEND", b""))
+    chunks = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+@pytest.mark.parametrize(
+    ("payload", "kind"),
+    [
+        pytest.param(compressed("png", bomb()), COMPRESSED, id="png"),
+        pytest.param(compressed("16UC1; compressedDepth png", bytes(12) + bomb()), COMPRESSED, id="depth"),
+        pytest.param(compressed("jpeg", cv2.imencode(".webp", BGR)[1].tobytes()), COMPRESSED, id="no size"),
+        pytest.param(image(np.zeros((1, 2**25 + 1), np.uint8), "mono8"), IMAGE, id="raw"),
+    ],
+)
+def test_image_that_is_too_large_is_not_decoded(
+    camera: Camera, payload: bytes, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("imdecode", "cvtColor"):
+        monkeypatch.setattr(cv2, name, lambda *_, **__: pytest.fail("decoded"))
+    camera.send(payload, kind)
+    assert camera.frame() is None
+    assert camera.ros.problems == {"message": 1}
+    assert len(camera.reports) == 1
+    camera.send(image(BGR, "bgr8", ROS_NS + STEP_NS), at_ns=STEP_NS)
+    assert camera.seen().width == WIDTH
 
 
 def test_new_size_gets_a_new_shared_memory(camera: Camera) -> None:
