@@ -1,7 +1,7 @@
 """Images of ROS 2 topics → frames in shared memory, which `vision.sources` opens as `ros://…`.
 
 Depth is as in REP 118, `camera_info` as in `sensor_msgs`: K and D belong to the raw image, P to a topic
-whose name begins with `image_rect`.
+whose name has a word that begins with `image_rect`, as `image_rect/compressed`.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ class RosCamera:
             return
         self._info, lens = content, None
         try:
-            rectified = self.address.image.rpartition("/")[2].startswith("image_rect")
+            rectified = "/image_rect" in self.address.image
             lens = lens_of(cdr.decode(CAMERA_INFO, payload), rectified=rectified)
         except ValueError as error:
             self._problem("lens", f"no lens is used: {self.address.info}: {error}")

@@ -76,9 +76,9 @@ def png(pixels: NDArray[Any]) -> bytes:
 class Camera:
     """A `RosCamera` with topics of its own, and the newest frame that a reader sees."""
 
-    def __init__(self, info: bool = False) -> None:
+    def __init__(self, info: bool = False, topic: str = "image_raw") -> None:
         name = f"/test_{secrets.token_hex(6)}"
-        self.address = RosAddress(f"{name}/image_raw", info=f"{name}/camera_info" if info else None)
+        self.address = RosAddress(f"{name}/{topic}", info=f"{name}/camera_info" if info else None)
         self.reports: list[str] = []
         self.ros = RosCamera(self.address, self.reports.append)
         self.reader: SharedFrameReader | None = None
@@ -495,6 +495,31 @@ def test_lens_of_rectified_images_is_that_of_p() -> None:
     p = (300.0, 0.0, 3.5, 0.0, 0.0, 301.0, 2.5, 0.0, 0.0, 0.0, 1.0, 0.0)
     lens = lens_of(cdr.decode(CAMERA_INFO, info(p=p)), rectified=True)
     assert (lens.fx, lens.cx, lens.fy, lens.cy, lens.distortion) == (300.0, 3.5, 301.0, 2.5, ())
+
+
+@pytest.mark.parametrize(
+    ("topic", "fx"),
+    [
+        ("image_rect", 300.0),
+        ("image_rect/compressed", 300.0),
+        ("image_rect_color/compressed", 300.0),
+        ("image_raw/compressed", 400.0),
+        ("not_image_rect", 400.0),
+    ],
+)
+def test_topic_of_rectified_images_has_the_lens_of_p(topic: str, fx: float) -> None:
+    p = (300.0, 0.0, 3.5, 0.0, 0.0, 301.0, 2.5, 0.0, 0.0, 0.0, 1.0, 0.0)
+    camera = Camera(info=True, topic=topic)
+    try:
+        camera.send(info(p=p), CAMERA_INFO, camera.address.info)
+        raw = "compressed" not in topic
+        camera.send(image(BGR, "bgr8") if raw else compressed("png", png(BGR)), IMAGE if raw else COMPRESSED)
+        camera.seen()
+        assert camera.reader is not None
+        assert camera.reader.calibration is not None
+        assert camera.reader.calibration.model.fx == fx
+    finally:
+        camera.ros.close()
 
 
 def test_second_node_of_one_topic_is_named(camera: Camera) -> None:
