@@ -56,6 +56,7 @@ _OLDEST_NS = 60_000_000_000  # an older stamp is of another clock; a newer one m
 _AHEAD_NS = 50_000_000  # drivers' clocks and the steps of /clock run ahead so far
 _RETRY_NS = 1_000_000_000  # of a shared memory that cannot be created
 _STATUS_NS = 60_000_000_000
+_LONGEST_REASON = 200  # characters: a message's texts can have any length
 
 
 class RosCamera:
@@ -188,7 +189,8 @@ class RosCamera:
             rectified = "/image_rect" in self.address.image
             lens = lens_of(cdr.decode(CAMERA_INFO, payload), rectified=rectified)
         except ValueError as error:
-            self._problem("lens", f"no lens is used: {self.address.info}: {error}")
+            why = " ".join(str(error).split())[:_LONGEST_REASON]
+            self._problem("lens", f"no lens is used: {self.address.info}: {why}")
         if lens != self._lens:
             self._lens = lens
             self._remove()

@@ -447,6 +447,13 @@ def test_unusable_camera_info_is_named_and_images_come(known: Camera, fields: di
     assert known.ros.problems == {"lens": 1}
 
 
+def test_long_distortion_model_is_cut(known: Camera) -> None:
+    known.send(info(distortion_model="x\n" * 10_000), CAMERA_INFO, known.address.info)
+    (text,) = known.reports
+    assert "\n" not in text
+    assert len(text) < 400
+
+
 def test_truncated_camera_info_is_named(known: Camera) -> None:
     known.send(info()[:60], CAMERA_INFO, known.address.info)
     assert known.ros.problems == {"lens": 1}
