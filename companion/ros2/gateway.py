@@ -74,7 +74,8 @@ class ServiceClock:
     """ROS time of the stamps of a service: system time, or simulated time while there is one.
 
     Its stamps are CLOCK_MONOTONIC of its host. On this host the present difference to the system clock is
-    used, which may be set meanwhile; of another host that at the start of its service.
+    used, which may be set meanwhile; of another host that at the start of its service. A frame of
+    a camera of ROS has exactly the stamp of its image.
 
     Args:
         zenoh: settings of a client; the endpoint says whether the service may be on this host.
@@ -86,6 +87,7 @@ class ServiceClock:
         self._there_ns: int | None = None  # Unix time minus CLOCK_MONOTONIC of the service
         self._simulated_ns: int | None = None  # simulated time minus CLOCK_MONOTONIC of this host
         self._given: dict[int, int] = {}
+        self._of_images: dict[int, int] = {}
 
     def on_status(self, stamp_ns: int) -> None:
         """Process the stamp of a status, when it is received."""
@@ -105,16 +107,19 @@ class ServiceClock:
             self._given = {}
         self._simulated_ns = offset_ns
 
+    def on_frame(self, captured_ns: int, ros_ns: int) -> None:
+        """Process the stamp of an image of ROS that became a frame with this `captured_ns`, on this host."""
+        _keep(self._of_images, captured_ns, ros_ns)
+
     def ros_time_ns(self, stamp_ns: int) -> int:
         """Return the ROS time of a stamp of the service, at least 0: always the same of the same stamp.
 
         So all messages about a frame have equal stamps, by which `message_filters` finds them.
         """
-        given = self._given.get(stamp_ns)
+        given = self._of_images.get(stamp_ns, self._given.get(stamp_ns))
         if given is None:
-            given = self._given[stamp_ns] = self._computed_ns(stamp_ns)
-            if len(self._given) > _STAMPS_KEPT:
-                self._given.pop(next(iter(self._given)), None)
+            given = self._computed_ns(stamp_ns)
+            _keep(self._given, stamp_ns, given)
         return given
 
     def _computed_ns(self, stamp_ns: int) -> int:
@@ -124,6 +129,12 @@ class ServiceClock:
         if self._simulated_ns is not None:
             offset_ns = self._simulated_ns
         return max(0, stamp_ns + offset_ns)
+
+
+def _keep(stamps: dict[int, int], stamp_ns: int, ros_ns: int) -> None:
+    stamps[stamp_ns] = ros_ns
+    if len(stamps) > _STAMPS_KEPT:
+        stamps.pop(next(iter(stamps)), None)
 
 
 def _unix_offset_ns() -> int:

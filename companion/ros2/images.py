@@ -70,6 +70,8 @@ class RosCamera:
         address: its topic, and that of its lens; without depth, which is a camera of its own.
         report: called with one line at the first problem of each kind, and with `status` each minute in which
             there were more.
+        on_frame: called with `captured_ns` and the header's stamp, nanoseconds, before readers see a frame
+            whose stamp is used: messages about the frame can then have the stamp of its image.
 
     Attributes:
         topics: what to subscribe to → the type that image_transport's names give it.
@@ -77,14 +79,16 @@ class RosCamera:
             `lens`, `memory`.
     """
 
-    def __init__(self, address: RosAddress, report: Callable[[str], None]) -> None:
+    def __init__(
+        self, address: RosAddress, report: Callable[[str], None], on_frame: Callable[[int, int], None]
+    ) -> None:
         compressed = address.image.endswith(("/compressed", "/compressedDepth"))
         self.topics = {address.image: COMPRESSED if compressed else IMAGE}
         if address.info is not None:
             self.topics[address.info] = CAMERA_INFO
         self.address = address
         self.problems: Counter[str] = Counter()
-        self._report = report
+        self._report, self._on_frame = report, on_frame
         self._writer: SharedFrameWriter | None = None
         self._lens: CameraModel | None = None
         self._info = b""
@@ -140,9 +144,10 @@ class RosCamera:
 
     def _on_image(self, message: Mapping[str, Any], received_ns: int, ros_now_ns: int) -> None:
         self._received += 1  # readers count a gap as lost frames
-        captured_ns = self._capture(message["header"]["stamp"], received_ns, ros_now_ns)
-        if captured_ns is None:
+        capture = self._capture(message["header"]["stamp"], received_ns, ros_now_ns)
+        if capture is None:
             return
+        captured_ns, stamp_ns = capture
         pixels, conversion, is_depth = (_compressed if "format" in message else _raw)(message)
         scale_m = INTEGER_SCALE_M if pixels.dtype.kind == "u" else FLOAT_SCALE_M
         depth_m = to_metres(pixels, scale_m) if is_depth else None
@@ -150,6 +155,8 @@ class RosCamera:
         if writer is None:
             return
         self._captured_ns = max(captured_ns, self._captured_ns + 1)  # trackers need it to increase
+        if stamp_ns is not None:
+            self._on_frame(self._captured_ns, stamp_ns)
         with writer.slot(self._received, self._captured_ns) as (image, depth):
             if depth is not None:
                 image[:], depth[:] = 0, depth_m
@@ -159,8 +166,10 @@ class RosCamera:
                 cv2.cvtColor(pixels, conversion, dst=image)
         self._written += 1
 
-    def _capture(self, stamp: Mapping[str, int], received_ns: int, ros_now_ns: int) -> int | None:
-        """The capture by the header's stamp or the arrival; None: the message was received before."""
+    def _capture(
+        self, stamp: Mapping[str, int], received_ns: int, ros_now_ns: int
+    ) -> tuple[int, int | None] | None:
+        """The capture by the header's stamp, and that; or the arrival. None: it was received before."""
         stamp_ns = stamp["sec"] * 1_000_000_000 + stamp["nanosec"]
         before_ns, self._stamp_ns = self._stamp_ns, stamp_ns
         age_ns = ros_now_ns - stamp_ns
@@ -176,9 +185,9 @@ class RosCamera:
         elif stamp_ns < before_ns:
             why = f"is {(before_ns - stamp_ns) / 1e9:.3f} s before the previous one"
         else:
-            return received_ns - max(age_ns, 0)
+            return received_ns - max(age_ns, 0), stamp_ns
         self._problem("stamp", f"the stamp of a message {why}; its arrival is used")
-        return received_ns
+        return received_ns, None
 
     def _on_info(self, payload: bytes | memoryview) -> None:
         content = bytes(payload[12:])  # behind the stamp
@@ -228,14 +237,16 @@ class RosCamera:
             self._unsaid = True
 
 
-def ros_cameras(uris: Iterable[str], report: Callable[[str], None]) -> tuple[RosCamera, ...]:
+def ros_cameras(
+    uris: Iterable[str], report: Callable[[str], None], on_frame: Callable[[int, int], None]
+) -> tuple[RosCamera, ...]:
     """Return the cameras of the `ros://` addresses among these. Raises SourceError for a wrong one."""
     addresses: dict[RosAddress, None] = {}
     for address in [parse_ros_address(uri) for uri in uris if uri.startswith(SCHEME)]:
         addresses[replace(address, depth=None)] = None
         if address.depth is not None:
             addresses[RosAddress(address.depth)] = None
-    return tuple(RosCamera(address, report) for address in addresses)
+    return tuple(RosCamera(address, report, on_frame) for address in addresses)
 
 
 class _UnknownEncodingError(ValueError):

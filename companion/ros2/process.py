@@ -270,7 +270,7 @@ async def run_node(
     section, vehicle = client_settings(settings.zenoh), settings.vehicle.name
     clock, refused = ServiceClock(section), ""
     uris = [uri for source in settings.sources().values() for uri in (source.uri, source.depth) if uri]
-    cameras = ros_cameras(uris, say)
+    cameras = ros_cameras(uris, say, clock.on_frame)
     with ExitStack() as stack:
         if (session := await _open_session(stack, section, ended, say)) is None:
             return

@@ -277,3 +277,25 @@ def test_messages_of_one_frame_have_one_stamp() -> None:
     assert {clock.ros_time_ns(stamp_ns) for _ in range(100)} == {first}
     clock.on_ros_time(stamp_ns, 5 * 10**9, True)
     assert clock.ros_time_ns(stamp_ns) == 5 * 10**9
+
+
+def test_messages_of_a_frame_of_ros_have_the_stamp_of_its_image() -> None:
+    clock, captured_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    computed = clock.ros_time_ns(captured_ns)
+    image_ns = computed + 123_457
+    clock.on_frame(captured_ns, image_ns)
+    assert clock.ros_time_ns(captured_ns) == image_ns
+    for later in range(1, 2000):  # other stamps, as those of the vehicle
+        clock.ros_time_ns(captured_ns + later)
+    clock.on_ros_time(captured_ns, 5 * 10**9, True)
+    clock.on_status(captured_ns - 60 * 10**9)
+    clock.on_run(7 * 10**15)
+    assert clock.ros_time_ns(captured_ns) == image_ns
+
+
+def test_stamps_of_images_are_kept_for_the_newest_512() -> None:
+    clock, captured_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    for index in range(513):
+        clock.on_frame(captured_ns + index, index)
+    assert clock.ros_time_ns(captured_ns) != 0
+    assert [clock.ros_time_ns(captured_ns + index) for index in range(1, 513)] == list(range(1, 513))

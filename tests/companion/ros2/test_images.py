@@ -74,13 +74,14 @@ def png(pixels: NDArray[Any]) -> bytes:
 
 
 class Camera:
-    """A `RosCamera` with topics of its own, and the newest frame that a reader sees."""
+    """A `RosCamera` with topics of its own, the stamps of its frames, and the newest that a reader sees."""
 
     def __init__(self, info: bool = False, topic: str = "image_raw") -> None:
         name = f"/test_{secrets.token_hex(6)}"
         self.address = RosAddress(f"{name}/{topic}", info=f"{name}/camera_info" if info else None)
         self.reports: list[str] = []
-        self.ros = RosCamera(self.address, self.reports.append)
+        self.stamps: dict[int, int] = {}
+        self.ros = RosCamera(self.address, self.reports.append, self.stamps.__setitem__)
         self.reader: SharedFrameReader | None = None
 
     def send(
@@ -212,6 +213,34 @@ def test_impossible_stamp_is_replaced_by_the_arrival(camera: Camera, stamp_ns: i
     assert camera.ros.problems == {"stamp": 3}
     assert len(camera.reports) == 1
     assert "3 stamp" in camera.ros.status(ARRIVAL_NS)
+
+
+def test_stamp_is_reported_with_the_capture_that_is_written(camera: Camera) -> None:
+    expected = {}
+    # The stamps of the first two are ahead of an arrival at the same time: 1 ns is added to the second one.
+    for stamp_ns in (ROS_NS + 30_000_000, ROS_NS + 40_000_000):
+        camera.send(image(BGR, "bgr8", stamp_ns))
+        expected[camera.seen().captured_ns] = stamp_ns
+    camera.send(image(BGR, "bgr8", ROS_NS + STEP_NS + 10_000_000), at_ns=STEP_NS)
+    expected[camera.seen().captured_ns] = ROS_NS + STEP_NS + 10_000_000
+    assert len(expected) == 3
+    assert camera.stamps == expected
+
+
+def test_stamp_that_is_replaced_is_not_reported(camera: Camera) -> None:
+    camera.send(image(BGR, "bgr8", 0))
+    camera.send(image(BGR, "nv21"), at_ns=STEP_NS)
+    assert camera.stamps == {}
+
+
+def test_stamp_is_reported_before_the_frame_is_seen(camera: Camera) -> None:
+    seen = []
+    camera.ros = RosCamera(camera.address, camera.reports.append, lambda *_: seen.append(camera.frame()))
+    try:
+        camera.send(image(BGR, "bgr8"))
+    finally:
+        camera.ros.close()
+    assert seen == [None]
 
 
 def test_stamp_a_little_ahead_is_the_arrival_uncounted(camera: Camera) -> None:
@@ -546,7 +575,7 @@ def test_topics_have_the_types_of_image_transport() -> None:
         "ros://cam/image_raw?depth=/cam/depth/compressedDepth",
         "ros://cam/image_raw",
     ]
-    assert [camera.topics for camera in ros_cameras(uris, print)] == [
+    assert [camera.topics for camera in ros_cameras(uris, print, print)] == [
         {"/cam/image_raw/compressed": COMPRESSED, "/cam/camera_info": CAMERA_INFO},
         {"/cam/depth/compressedDepth": COMPRESSED},
         {"/cam/image_raw": IMAGE},

@@ -22,7 +22,7 @@ import zenoh
 
 from companion.bus.client import listen
 from mavlink_sim.testing import free_port
-from tests.companion.ros2.ros_process import EACH_ROS, ROOT, BusSide, bus, domain, running_node
+from tests.companion.ros2.ros_process import EACH_ROS, ROOT, BusSide, bus, domain, ros_peer, running_node
 from tests.companion.service_process import heartbeats, running_service
 from tests.programs import ROS_PYTHONS
 from vision.frame import Frame
@@ -66,17 +66,21 @@ def environment(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Publisher:
-    """A node that publishes images. `sent`: the CLOCK_MONOTONIC of each stamp."""
+    """A node that publishes images. `sent`: the CLOCK_MONOTONIC of each of the `stamps`, in ROS time."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.sent: list[int] = []
+        self.stamps: list[int] = []
         self._process = process
-        threading.Thread(target=self._read, daemon=True).start()
+        self.reading = threading.Thread(target=self._read, daemon=True)
+        self.reading.start()
 
     def _read(self) -> None:
         assert self._process.stdout is not None
         for line in self._process.stdout:
-            self.sent.append(int(line.split()[1]))
+            stamp_ns, sent_ns = map(int, line.split())
+            self.stamps.append(stamp_ns)
+            self.sent.append(sent_ns)
 
     def nearest_ns(self, captured_ns: int) -> int:
         """The smallest difference of a capture to what was sent."""
@@ -94,11 +98,13 @@ def publisher(ros: str, topic: str, kind: str, *arguments: str, **options: Any) 
     assert process.stdout is not None
     process.stdin.write(JPEG)
     process.stdin.close()
+    made = Publisher(process)
     try:
-        yield Publisher(process)
+        yield made
     finally:
         process.kill()
         process.wait()
+        made.reading.join()
 
 
 @contextmanager
@@ -219,6 +225,24 @@ def test_simulated_time_becomes_the_time_of_capture(ros: str, tmp_path: Path) ->
         differences_ns = [camera.nearest_ns(each["captured_ns"]) for each in detections.next(30)]
     # As exact as the steps of /clock.
     assert statistics.median(differences_ns) < 10_000_000
+
+
+@pytest.mark.parametrize("clock_speed", [0.0, 0.5])
+@pytest.mark.parametrize("ros", EACH_ROS)
+def test_messages_about_an_image_have_its_stamp(ros: str, clock_speed: float, tmp_path: Path) -> None:
+    topic, answer = "/camera/image_raw/compressed", "/drone1/detections"
+    arguments = ("--", "--ros-args", "-p", "use_sim_time:=true") if clock_speed else ()
+    with shared_at_the_same_rate() as shared, ExitStack() as stack:
+        camera = stack.enter_context(publisher(ros, topic, "jpeg", clock_speed=clock_speed))
+        detections = stack.enter_context(service_and_node(ros, tmp_path, f"ros:/{topic}", shared, *arguments))
+        peer = stack.enter_context(ros_peer(ros))
+        detections.next(10)
+        peer.subscribe(answer, "vision_msgs/msg/Detection2DArray")
+        stamps = [peer.message(answer)["header"]["stamp"] for _ in range(30)]
+    seen_ns = {stamp["sec"] * 1_000_000_000 + stamp["nanosec"] for stamp in stamps}
+    assert len(seen_ns) == 30
+    away_ns = [min(abs(each - sent) for sent in camera.stamps) for each in seen_ns]
+    assert set(away_ns) == {0}, f"median {statistics.median(away_ns)} ns"
 
 
 @pytest.mark.parametrize("ros", EACH_ROS)
