@@ -31,6 +31,7 @@ def vehicle_message(state: VehicleState, now_ns: int) -> VehicleBody:
         "connected": state.connected(now_ns),
         "heartbeat_age_s": _age_s(state.heartbeat_ns, now_ns),
         "position_age_s": _age_s(state.position_ns, now_ns),
+        "global_age_s": _age_s(state.global_ns, now_ns),
         "boot_offset_ns": None if state.clock is None else state.clock.offset_ns,
         "boot_error_ns": None if state.clock is None else state.clock.error_ns,
         "armed": state.armed,

@@ -35,8 +35,10 @@ from vision.image_file import decode_image
 _Body = dict[str, Any]
 _NAN = math.nan
 _PNG = b"\x89PNG"
-# sensor_msgs: PointField.FLOAT32, NavSatStatus.STATUS_FIX, .STATUS_NO_FIX and .SERVICE_GPS.
-_FLOAT32, _FIX, _NO_FIX, _GPS = 7, 0, -1, 1
+# sensor_msgs: PointField.FLOAT32, and NavSatStatus.STATUS_UNKNOWN, .STATUS_FIX and .STATUS_NO_FIX.
+_FLOAT32 = 7
+_FIX_STATUS = {None: -2, True: 0, False: -1}
+_SERVICE_UNKNOWN = 0
 _POINT_BYTES = 16
 _POINT_FIELDS = [
     {"name": name, "offset": 4 * index, "datatype": _FLOAT32, "count": 1}
@@ -273,13 +275,15 @@ class Messages:
 
     def _fix(self, _frame: str, body: _Body, _payload: bytes) -> _Body | None:
         """The altitude is above mean sea level: the autopilot sends no other."""
-        if body["latitude_deg"] is None or body["longitude_deg"] is None:
+        # Recordings of before `global_age_s` have the age of the local position alone.
+        age_s = body.get("global_age_s", body["position_age_s"])
+        if body["latitude_deg"] is None or body["longitude_deg"] is None or age_s is None:
             return None
-        status = _NO_FIX if body["position_valid"] is False else _FIX
+        status = _FIX_STATUS[body["position_valid"]]
         altitude_m = body["altitude_amsl_m"]
         return {
-            "header": self._header(_position_ns(body), _BASE.frame),
-            "status": {"status": status, "service": _GPS},
+            "header": self._header(_received_ns(body, age_s), _BASE.frame),
+            "status": {"status": status, "service": _SERVICE_UNKNOWN},
             "latitude": body["latitude_deg"],
             "longitude": body["longitude_deg"],
             "altitude": _NAN if altitude_m is None else altitude_m,
@@ -290,7 +294,8 @@ class Messages:
         if position is None or attitude is None or body["position_valid"] is False:
             return None
         pose = {"position": _MAP.vector(position), "orientation": _MAP.rotation(attitude, _BASE)}
-        return {"header": self._header(_position_ns(body), _MAP.frame), "pose": pose}
+        received_ns = _received_ns(body, body["position_age_s"])
+        return {"header": self._header(received_ns, _MAP.frame), "pose": pose}
 
     def _battery(self, _frame: str, body: _Body, _payload: bytes) -> _Body | None:
         if body["battery_fraction"] is None:
@@ -326,8 +331,8 @@ class Messages:
         return {"header": {**self._header(body["stamp_ns"], ""), "frame_id": ""}, "status": status}
 
 
-def _position_ns(body: _Body) -> int:
-    age_s: float | None = body["position_age_s"]
+def _received_ns(body: _Body, age_s: float | None) -> int:
+    """When what has this age was received; without an age, the stamp of the message."""
     stamp_ns: int = body["stamp_ns"]
     return stamp_ns if age_s is None else stamp_ns - round(age_s * 1e9)
 

@@ -40,6 +40,8 @@ class VehicleBody(TypedDict):
     """age of the newest heartbeat"""
     position_age_s: float | None
     """age of the position"""
+    global_age_s: float | None
+    """age of the global position"""
     boot_offset_ns: int | None
     """the autopilot's clock minus CLOCK_MONOTONIC; null until known"""
     boot_error_ns: int | None

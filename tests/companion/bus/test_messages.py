@@ -184,6 +184,7 @@ def test_vehicle_message_in_flight() -> None:
     state = VehicleState(
         heartbeat_ns=now_ns - 500_000_000,
         position_ns=now_ns - 20_000_000,
+        global_ns=now_ns - 300_000_000,
         armed=True,
         mode=FlightMode.OFFBOARD,
         position_ned_m=(1.0, 2.0, -4.0),
@@ -193,7 +194,7 @@ def test_vehicle_message_in_flight() -> None:
     message = vehicle_message(state, now_ns)
     assert message["connected"]
     assert message["altitude_m"] == 5.0
-    assert message["position_age_s"] == 0.02
+    assert (message["position_age_s"], message["global_age_s"]) == (0.02, 0.3)
     assert message["mode"] == "offboard"
 
 

@@ -60,6 +60,7 @@ FLU_FROM_FRD = np.diag([1, -1, -1])
 STATE = VehicleState(
     heartbeat_ns=CAPTURED_NS,
     position_ns=CAPTURED_NS - 40_000_000,
+    global_ns=CAPTURED_NS - 300_000_000,
     attitude_ns=CAPTURED_NS,
     position_ned_m=(1.0, 2.0, -3.0),
     velocity_ned_mps=(0.0, 0.0, 0.0),
@@ -104,7 +105,8 @@ def test_every_topic_is_made_with_the_stamp_of_its_message(topic: RosTopic) -> N
         [each["header"] for each in message["transforms"]] if topic.name == "/tf" else [message["header"]]
     )
     headers += [each["header"] for each in message.get("detections", ())]
-    age_ns = round(body["position_age_s"] * 1e9) if topic.name in ("fix", "pose") else 0
+    age_of = {"fix": "global_age_s", "pose": "position_age_s"}.get(topic.name)
+    age_ns = round(body[age_of] * 1e9) if age_of else 0
     expected = body.get("captured_ns", body.get("stamp_ns", 0)) - age_ns + OFFSET_NS
     assert {stamp_ns(header) for header in headers} == {expected}
 
@@ -288,8 +290,9 @@ def test_fix_and_battery() -> None:
     body = {**vehicle_message(STATE, CAPTURED_NS), "battery_fraction": 0.5}
     fix = converted("fix", json.dumps(body).encode())
     assert (fix["latitude"], fix["longitude"], fix["altitude"]) == (47.4, 8.5, 500.0)
-    assert (fix["status"], fix["position_covariance_type"]) == ({"status": 0, "service": 1}, 0)
+    assert (fix["status"], fix["position_covariance_type"]) == ({"status": -2, "service": 0}, 0)
     assert fix["header"]["frame_id"] == "drone1/base_link"
+    assert stamp_ns(fix["header"]) == CAPTURED_NS - 300_000_000 + OFFSET_NS
     battery = converted("battery", json.dumps(body).encode())
     assert (battery["percentage"], battery["present"]) == (0.5, True)
     assert all(math.isnan(battery[name]) for name in ("voltage", "current", "charge", "capacity"))
@@ -300,6 +303,7 @@ def test_fix_and_battery() -> None:
     [
         ("fix", {"latitude_deg": None}),
         ("fix", {"longitude_deg": None}),
+        ("fix", {"global_age_s": None}),
         ("pose", {"position_ned_m": None}),
         ("pose", {"attitude_wxyz": None}),
         ("pose", {"position_valid": False}),
@@ -310,10 +314,18 @@ def test_what_is_not_known_is_not_sent(name: str, changes: dict[str, Any]) -> No
     assert of(name, **changes) is None
 
 
-def test_fix_without_height_or_of_a_bad_estimate_says_so() -> None:
-    fix = of("fix", altitude_amsl_m=None, position_valid=False)
+@pytest.mark.parametrize(("valid", "status"), [(True, 0), (False, -1), (None, -2)])
+def test_fix_says_whether_the_estimate_is_usable(valid: bool | None, status: int) -> None:
+    fix = of("fix", altitude_amsl_m=None, position_valid=valid)
     assert math.isnan(fix["altitude"])
-    assert fix["status"]["status"] == -1
+    assert fix["status"] == {"status": status, "service": 0}
+
+
+def test_fix_of_an_older_recording_has_the_age_of_the_position() -> None:
+    body = vehicle_message(STATE, CAPTURED_NS)
+    older = {name: value for name, value in body.items() if name != "global_age_s"}
+    fix = converted("fix", json.dumps(older).encode())
+    assert stamp_ns(fix["header"]) == CAPTURED_NS - 40_000_000 + OFFSET_NS
 
 
 def test_stamp_without_an_age_is_that_of_the_message() -> None:
