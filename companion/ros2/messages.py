@@ -39,6 +39,7 @@ _PNG = b"\x89PNG"
 _FLOAT32 = 7
 _FIX_STATUS = {None: -2, True: 0, False: -1}
 _SERVICE_UNKNOWN = 0
+_UNKNOWN_VARIANCE = 1e6  # of a position in m², of a rotation in rad²; 0 would be exact
 _POINT_BYTES = 16
 _POINT_FIELDS = [
     {"name": name, "offset": 4 * index, "datatype": _FLOAT32, "count": 1}
@@ -192,13 +193,18 @@ class Messages:
         return {"stamp": {"sec": seconds, "nanosec": rest_ns}, "frame_id": self._prefix + frame}
 
     def _detections(self, frame: str, body: _Body, _payload: bytes) -> _Body:
-        """With depth, a pose is that of the nearest visible point, in the camera's axes."""
+        """With depth, a pose is that of the nearest visible point, in the camera's axes, with the variance of
+        z. All others are 1e6: unknown.
+        """
         header = self._header(body["captured_ns"], frame)
         detections = []
         for found in body["detections"]:
             left, top, right, bottom = found["xyxy"]
             point = found["nearest_camera_m"]
-            pose = {} if point is None else {"pose": {"position": dict(zip("xyz", point, strict=True))}}
+            sigma_m = None if point is None else found.get("depth_sigma_m")
+            pose: _Body = {"covariance": _covariance(z_m2=None if sigma_m is None else sigma_m**2)}
+            if point is not None:
+                pose["pose"] = {"position": dict(zip("xyz", point, strict=True))}
             center = {"position": dict(zip("xy", found["center"], strict=True))}
             bbox = {"center": center, "size_x": right - left, "size_y": bottom - top}
             track = "" if found["track_id"] is None else str(found["track_id"])
@@ -206,7 +212,9 @@ class Messages:
         return {"header": header, "detections": detections}
 
     def _detections_3d(self, _frame: str, body: _Body, _payload: bytes) -> _Body:
-        """The objects in this frame that have a position. Size and variance of the height are 0: unknown."""
+        """The objects in this frame that have a position. Their size is 0: unknown; the variances of height
+        and rotation are 1e6: unknown.
+        """
         header = self._header(body["captured_ns"], _MAP.frame)
         scores = {each["object_id"]: each["confidence"] for each in body["detections"]}
         detections = []
@@ -214,7 +222,8 @@ class Messages:
             if found["position_ned_m"] is None or found["occluded"]:
                 continue
             north_north, north_east, _, _, _, east_east, *_ = found["covariance"]
-            covariance = [east_east, north_east, *[0.0] * 4, north_east, north_north, *[0.0] * 28]
+            covariance = _covariance(east_east, north_north)
+            covariance[1] = covariance[6] = north_east
             center = {"position": _MAP.vector(found["position_ned_m"])}
             pose, number = {"pose": center, "covariance": covariance}, found["object_id"]
             score = scores.get(number, 0.0)
@@ -335,6 +344,15 @@ def _received_ns(body: _Body, age_s: float | None) -> int:
     """When what has this age was received; without an age, the stamp of the message."""
     stamp_ns: int = body["stamp_ns"]
     return stamp_ns if age_s is None else stamp_ns - round(age_s * 1e9)
+
+
+def _covariance(
+    x_m2: float | None = None, y_m2: float | None = None, z_m2: float | None = None
+) -> list[float]:
+    """Return the 6×6 covariance of a pose with these variances; None, and the rotation's: unknown."""
+    known = (x_m2, y_m2, z_m2, None, None, None)
+    covariance = np.diag([_UNKNOWN_VARIANCE if each is None else each for each in known])
+    return [float(each) for each in covariance.flat]
 
 
 def _detection(

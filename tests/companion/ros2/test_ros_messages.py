@@ -93,6 +93,12 @@ def xyz(vector: dict[str, float]) -> list[float]:
     return [vector["x"], vector["y"], vector["z"]]
 
 
+def variances(result: dict[str, Any]) -> list[float]:
+    covariance = np.reshape(result["pose"]["covariance"], (6, 6))
+    np.testing.assert_array_equal(covariance, np.diag(np.diag(covariance)))
+    return [float(each) for each in np.diag(covariance)]
+
+
 @pytest.mark.parametrize("topic", OUTPUT_TOPICS, ids=lambda topic: topic.name)
 def test_every_topic_is_made_with_the_stamp_of_its_message(topic: RosTopic) -> None:
     payload, attachment = payload_for(topic)
@@ -127,7 +133,7 @@ def test_latched_is_what_the_bus_keeps_one_of() -> None:
 
 def test_detection_has_class_score_track_and_box() -> None:
     found = detection(class_name="Käfer", confidence=0.83, track_id=17, xyxy=[10.0, 20.0, 40.0, 60.0],
-                      center=[25.0, 40.0], nearest_camera_m=[0.5, -0.25, 8.0])  # fmt: skip
+                      center=[25.0, 40.0], nearest_camera_m=[0.5, -0.25, 8.0], depth_sigma_m=0.2)  # fmt: skip
     message = of("detections", camera="down", detections=[found], captured_ns=CAPTURED_NS)
     assert message["header"]["frame_id"] == "drone1/cameras/down"
     (each,) = message["detections"]
@@ -135,6 +141,7 @@ def test_detection_has_class_score_track_and_box() -> None:
     (result,) = each["results"]
     assert result["hypothesis"] == {"class_id": "Käfer", "score": 0.83}
     assert xyz(result["pose"]["pose"]["position"]) == [0.5, -0.25, 8.0]
+    assert variances(result) == [1e6, 1e6, 0.2**2, 1e6, 1e6, 1e6]
     assert each["id"] == "17"
     box = each["bbox"]
     assert (box["center"]["position"], box["center"]["theta"]) == ({"x": 25.0, "y": 40.0}, 0.0)
@@ -146,7 +153,13 @@ def test_detection_without_track_and_depth_has_no_id_and_no_position() -> None:
     (each,) = message["detections"]
     assert each["id"] == ""
     assert xyz(each["results"][0]["pose"]["pose"]["position"]) == [0.0, 0.0, 0.0]
+    assert variances(each["results"][0]) == [1e6] * 6
     assert of("detections", detections=[])["detections"] == ()
+
+
+def test_depth_without_a_known_error_is_not_exact() -> None:
+    message = of("detections", detections=[detection(depth_sigma_m=None)])
+    assert variances(message["detections"][0]["results"][0]) == [1e6] * 6
 
 
 def test_object_has_its_position_in_enu_with_covariance() -> None:
@@ -168,7 +181,7 @@ def test_object_has_its_position_in_enu_with_covariance() -> None:
     assert xyz(result["pose"]["pose"]["position"]) == [20.0, 10.0, 1.5]
     assert each["bbox"]["center"] == result["pose"]["pose"]
     rotated = ENU_FROM_NED[:2, :2] @ covariance[:2, :2] @ ENU_FROM_NED[:2, :2].T
-    expected = np.zeros((6, 6))
+    expected = np.diag([1e6] * 6)
     expected[:2, :2] = rotated
     np.testing.assert_array_equal(np.reshape(result["pose"]["covariance"], (6, 6)), expected)
 
