@@ -1,8 +1,8 @@
 """The bus as messages of ROS 2: which topic is made of which message, and how.
 
 ROS's axes (REP 103) differ from ours: a map is ENU instead of NED, a body FLU instead of FRD. A camera's
-optical axes are the same. Frames (REP 105): `map` (origin of local NED), `base_link`, `gimbal`, `camera` and
-`cameras/NAME`, each after the prefix of the vehicle.
+optical axes are the same. Frames (REP 105): `map` (origin of local NED), `base_link`, `gimbal`,
+`camera_optical` and `cameras/NAME_optical`, each after the prefix of the vehicle.
 """
 
 from __future__ import annotations
@@ -135,7 +135,12 @@ _FRAMES = {"ned": _MAP, "body": _BASE, "gimbal": _BASE._replace(frame="gimbal")}
 def _axes_of(frame_id: str) -> _Axes:
     """Of a frame `<vehicle>/…` of ours; the others are optical frames of cameras."""
     name = frame_id.partition("/")[2]
-    return _FRAMES.get(name) or _Axes(name, (1.0, 0.0, 0.0, 0.0))
+    return _FRAMES.get(name) or _Axes(_optical_frame(name), (1.0, 0.0, 0.0, 0.0))
+
+
+def _optical_frame(name: str) -> str:
+    """Of a camera's frame of ours, with the suffix of REP 103."""
+    return f"{name}_optical"
 
 
 class Messages:
@@ -177,7 +182,7 @@ class Messages:
             ValueError: the message is not what its topic says.
         """
         source, body = topic.source, {}
-        frame = "camera" if camera is None else f"cameras/{camera}"
+        frame = _optical_frame("camera" if camera is None else f"cameras/{camera}")
         try:
             if source != LABELS:
                 body = parse_object((attachment or b"") if source in LARGE_TOPICS else payload)

@@ -109,13 +109,13 @@ def test_stamps_and_times_are_unix_time(bag: dict[str, tuple[str, int, Any]]) ->
 def test_contents_are_those_of_the_recording(bag: dict[str, tuple[str, int, Any]]) -> None:
     image = bag["/drone_1/image/compressed"][2]
     assert (bytes(image["data"]), image["format"]) == (JPEG, "jpeg")
-    assert image["header"]["frame_id"] == "drone_1/camera"
+    assert image["header"]["frame_id"] == "drone_1/camera_optical"
     cloud = bag["/drone_1/points"][2]
     points = np.array(cloud["data"], np.uint8).reshape(-1, cloud["point_step"])
     np.testing.assert_array_equal(points[:, :12].copy().view("<f4"), POINTS.points)
     assert bag["/drone_1/labels"][2] == {"data": "car, person"}
     assert bag["/drone_1/cameras/front_left/detections"][2]["header"]["frame_id"] == (
-        "drone_1/cameras/front-left"
+        "drone_1/cameras/front-left_optical"
     )
 
 

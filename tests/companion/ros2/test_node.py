@@ -93,7 +93,7 @@ def test_late_subscriber_gets_the_camera_info(ros: str, bus: BusSide) -> None:
         bus.put(CAMERA_INFO, LENS)
         expected = first.message("/drone1/camera_info")
         assert expected["k"] == LENS["k"]
-        assert expected["header"]["frame_id"] == "drone1/camera"
+        assert expected["header"]["frame_id"] == "drone1/camera_optical"
         late.subscribe("/drone1/camera_info", "sensor_msgs/msg/CameraInfo", latched=True)
         assert late.message("/drone1/camera_info") == expected
 
@@ -250,7 +250,7 @@ def test_names_are_remapped_by_the_arguments_of_ros(ros: str, bus: BusSide) -> N
         peer.graph_until(lambda graph: expected <= graph["topics"].keys())
         peer.subscribe("/alpha/camera_info", "sensor_msgs/msg/CameraInfo", latched=True)
         bus.put(CAMERA_INFO, LENS)
-        assert peer.message("/alpha/camera_info")["header"]["frame_id"] == "alpha/camera"
+        assert peer.message("/alpha/camera_info")["header"]["frame_id"] == "alpha/camera_optical"
 
 
 @pytest.mark.parametrize("ros", JAZZY)
@@ -359,7 +359,7 @@ def test_300_of_300_detections_arrive_with_every_field(ros: str, bus: BusSide) -
     assert max(abs(stamp - body["captured_ns"] - offset_ns) for stamp, body in stamps) < 1_000_000
     for message, body in zip(received, sent, strict=True):
         header = message["header"]
-        assert header["frame_id"] == "drone1/camera"
+        assert header["frame_id"] == "drone1/camera_optical"
         for found, expected in zip(message["detections"], body["detections"], strict=True):
             (result,) = found["results"]
             assert found["header"] == header

@@ -135,7 +135,7 @@ def test_detection_has_class_score_track_and_box() -> None:
     found = detection(class_name="Käfer", confidence=0.83, track_id=17, xyxy=[10.0, 20.0, 40.0, 60.0],
                       center=[25.0, 40.0], nearest_camera_m=[0.5, -0.25, 8.0], depth_sigma_m=0.2)  # fmt: skip
     message = of("detections", camera="down", detections=[found], captured_ns=CAPTURED_NS)
-    assert message["header"]["frame_id"] == "drone1/cameras/down"
+    assert message["header"]["frame_id"] == "drone1/cameras/down_optical"
     (each,) = message["detections"]
     assert each["header"] == message["header"]
     (result,) = each["results"]
@@ -220,7 +220,7 @@ def test_camera_info_is_that_of_the_bus() -> None:
     message, body = converted("camera_info", payload), json.loads(payload)
     names = ("height", "width", "distortion_model", "d", "k", "r", "p")
     assert equal({name: message[name] for name in names}, {name: body[name] for name in names})
-    assert message["header"]["frame_id"] == "drone1/camera"
+    assert message["header"]["frame_id"] == "drone1/camera_optical"
 
 
 def test_points_have_places_and_colours() -> None:
@@ -247,8 +247,8 @@ def test_points_have_places_and_colours() -> None:
 @pytest.mark.parametrize(
     ("mount", "children"),
     [
-        (CameraMount(0.1, 0.02, 0.05, 0.1, -0.4, 0.2), ["base_link", "cameras/down"]),
-        (CameraMount(0.1, yaw_rad=0.1, on_gimbal=True), ["base_link", "gimbal", "cameras/down"]),
+        (CameraMount(0.1, 0.02, 0.05, 0.1, -0.4, 0.2), ["base_link", "cameras/down_optical"]),
+        (CameraMount(0.1, yaw_rad=0.1, on_gimbal=True), ["base_link", "gimbal", "cameras/down_optical"]),
     ],
     ids=["fixed", "gimbal"],
 )
