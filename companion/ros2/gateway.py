@@ -214,14 +214,19 @@ class Gateway:
         users = tuple(self._wanted.get((first.source.name, camera), ()))
         try:
             payload, attachment = message_of(sample, first.source)
-            with self._converting:
-                made: dict[str, bytes | None] = {}
-                for _, topic in users:
-                    if topic.name not in made:
-                        made[topic.name] = self._messages.convert(topic, camera, payload, attachment)
         except (ValueError, KeyError, TypeError) as error:
             self._losses.add(f"{first.source.path(camera)}: {error}")
             return
+        made: dict[str, bytes | None] = {}
+        with self._converting:
+            for _, topic in users:
+                if topic.name in made:
+                    continue
+                try:
+                    made[topic.name] = self._messages.convert(topic, camera, payload, attachment)
+                except ValueError as error:
+                    made[topic.name] = None
+                    self._losses.add(f"{first.source.path(camera)}: {error}")
         for sink, topic in users:
             if (cdr := made[topic.name]) is not None:
                 sink.publish(topic_name(topic, camera), topic, cdr)

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from companion.bus import topics
 from companion.bus.client import client_settings, open_client
 from companion.bus.topics import LABELS, STATUS, VELOCITY
 from companion.host.peer_data import parse_object
@@ -28,6 +29,7 @@ from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_pre
 from companion.ros2.process import Ros2Error, find_python
 from companion.ros2.requests import STRING, TWIST, Requests
 from companion.settings import Settings, ZenohSection
+from tests.companion.ros2.bus_samples import payload_of
 from tests.companion.ros2.ros_process import VEHICLE, WAIT_S, BusSide, bus
 
 __all__ = ["bus"]
@@ -146,6 +148,27 @@ def test_bus_is_read_while_any_sink_wants_it(bus: BusSide) -> None:
         gateway.want(second, labels, None, False)
         bus.wait_for_reader(LABELS, wanted=False)
         gateway.close()
+
+
+@pytest.mark.realtime
+def test_topic_that_cannot_be_made_keeps_no_other_back(bus: BusSide) -> None:
+    """Of a vehicle without its battery; as the battery is wanted first and by two, it is one loss."""
+    lines: list[str] = []
+    body = json.loads(payload_of(topics.VEHICLE)[0])
+    del body["battery_fraction"]
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), lines.append)
+        first, second = ListSink(), ListSink()
+        for sink, name in ((first, "battery"), (second, "battery"), (first, "fix"), (first, "pose")):
+            gateway.want(sink, BY_NAME[name], None, True)
+        bus.wait_for_reader(topics.VEHICLE)
+        bus.put(topics.VEHICLE, body)
+        names = [first.published.get(timeout=WAIT_S)[0] for _ in range(2)]
+        gateway.close()
+    assert names == ["fix", "pose"]
+    assert second.published.empty()
+    assert len(lines) == 1
+    assert "BatteryState" in lines[0]
 
 
 @pytest.mark.realtime
