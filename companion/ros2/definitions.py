@@ -32,10 +32,8 @@ _FIELDS = {
         "Transform": "Vector3 translation; Quaternion rotation",
         "TransformStamped": "std_msgs/Header header; string child_frame_id; Transform transform",
         "Twist": "Vector3 linear; Vector3 angular",
-        "TwistStamped": "std_msgs/Header header; Twist twist",
         "Vector3": "float64 x; float64 y; float64 z",
     },
-    "rosgraph_msgs": {"Clock": "builtin_interfaces/Time clock"},
     "sensor_msgs": {
         "BatteryState": "std_msgs/Header header; float32 voltage; float32 temperature; float32 current; "
         "float32 charge; float32 capacity; float32 design_capacity; float32 percentage; "

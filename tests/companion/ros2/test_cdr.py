@@ -136,8 +136,8 @@ def test_a_huge_number_anywhere_is_read_or_refused(type_name: str) -> None:
         ("sensor_msgs/msg/CompressedImage", IMAGE),
         (IMAGE, "sensor_msgs/msg/CompressedImage"),
         (DETECTIONS, "vision_msgs/msg/Detection3DArray"),
-        ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"),
-        ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"),
+        ("geometry_msgs/msg/Twist", "geometry_msgs/msg/PoseStamped"),
+        ("geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/Twist"),
         ("std_msgs/msg/String", "std_msgs/msg/Header"),
     ],
 )

@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from companion.ros2.definitions import DEFINITIONS, full_definition, type_hash
+from companion.ros2.definitions import DEFINITIONS, fields_of, full_definition, type_hash
+from companion.ros2.messages import OUTPUT_TOPICS
+from companion.ros2.requests import STRING, TWIST
 from tests.programs import DATA
 
 # From rosbags with vision_msgs 4.1.1; of the three others from the wheels of ROS.
@@ -45,6 +47,12 @@ def test_vision_msgs_have_the_fields_of_their_project(type_name: str) -> None:
     text = (DATA / "ros2" / "vision_msgs" / f"{type_name.rpartition('/')[2]}.msg").read_text()
     theirs = get_types_from_msg(text, type_name)[type_name]
     assert get_types_from_msg(DEFINITIONS[type_name], type_name)[type_name] == theirs
+
+
+def test_every_definition_is_of_a_message_in_use() -> None:
+    used = {topic.type_name for topic in OUTPUT_TOPICS} | {STRING, TWIST}
+    inside = {field.type_name for name in DEFINITIONS for field in fields_of(name) if field.nested}
+    assert DEFINITIONS.keys() == used | inside
 
 
 def test_unknown_type_is_named() -> None:
