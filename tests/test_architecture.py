@@ -38,7 +38,7 @@ COMPANION_LAYERS = {
 }
 # What people and other programs reach a flight by; and the parts of these inside the service, or that
 # `import companion` offers.
-DOORS = (
+INTERFACES = (
     "companion.client",
     "companion.dashboard",
     "companion.language",
@@ -299,7 +299,7 @@ def in_workshop(module: str) -> bool:
 
 
 def in_doors(module: str) -> bool:
-    return f"{module}.".startswith(tuple(f"{package}." for package in DOORS))
+    return f"{module}.".startswith(tuple(f"{package}." for package in INTERFACES))
 
 
 def test_what_flies_imports_only_the_parts_of_doors_inside_the_service() -> None:
