@@ -46,7 +46,7 @@ INTERFACES = (
     "companion.recording",
     "companion.ros2",
 )
-DOORS_INSIDE = {
+INTERFACES_INSIDE = {
     "companion.client",
     "companion.operator.console",
     "companion.operator.metrics",
@@ -307,7 +307,7 @@ def test_what_flies_imports_only_the_parts_of_doors_inside_the_service() -> None
     for name, path in modules().items():
         if not (in_workshop(name) or in_doors(name) or name.startswith("companion.cli")):
             found |= set(filter(in_doors, imports_of(name, path)))
-    assert found == DOORS_INSIDE
+    assert found == INTERFACES_INSIDE
 
 
 def test_nothing_that_flies_imports_the_workshop() -> None:
