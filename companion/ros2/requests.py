@@ -6,6 +6,7 @@ import json
 import math
 import re
 import secrets
+import time
 from collections.abc import Callable
 from functools import partial
 from threading import Lock, Thread
@@ -21,13 +22,19 @@ from companion.ros2.gateway import NodeTopic
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 _CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
-_REPEATED_NS = 10_000_000_000
+_JUST_STARTED_NS = 5_000_000_000
+_REPEATED = "the same text again is no new request; publish an empty one before it"
 _SHOWN = 200  # characters of a command in its outcome
 # A mission takes so long.
 _TIMEOUT_S = 3600.0
 # A newer command ends the one before, so more than a few do not wait for their outcome at once.
 _MOST_COMMANDS = 16
 _DISABLED = "ros2.commands is false: the settings must allow commands from ROS"
+
+
+def _mission(wanted: str) -> str:
+    steps = (json.dumps(f'{word} "{wanted}"', ensure_ascii=False) for word in ("seek", "approach"))
+    return "mission object_to_seek\n" + "".join(f"[[step]]\ndo = {step}\n" for step in steps)
 
 
 class Requests:
@@ -61,8 +68,8 @@ class Requests:
             express=VELOCITY.express,
         )
         self._lock, self._running = Lock(), 0
-        self._object, self._object_ns = "", 0  # the newest that was received, and when
-        self._request = 0
+        self._object: str | None = None  # the newest that was received
+        self._started_ns = time.monotonic_ns()
 
     def topics(self) -> tuple[NodeTopic, ...]:
         """Return what a node subscribes to, and the topic of the outcomes."""
@@ -90,28 +97,30 @@ class Requests:
         self._velocities.put(json.dumps(body))
 
     def on_object(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
-        """Process the name of a class: `seek` it, then `approach` it.
+        """Process the name of a class: `seek` it, then `approach` it, as one mission, which the pilot ends.
 
-        A publisher may repeat it without end. So the same again within `_REPEATED_NS` is no new request, also
-        after another command or the pilot has ended the flight; an empty text ends the repetition.
+        A publisher may repeat it without end, also after the pilot or another command has ended the flight,
+        or after a gap of the network. So the same text again is no new request, nor is the first one just
+        after the start, which may be a repetition. An empty text ends the repetition.
         """
         wanted = str(decode(type_name, payload)["data"]).strip()
-        if wanted and not _CLASS_NAME.fullmatch(wanted):
-            self._answer(wanted, {"success": False, "reason": f"{name}: expected the name of a class"})
-            return
         with self._lock:
-            repeated = wanted == self._object and received_ns - self._object_ns < _REPEATED_NS
-            self._object, self._object_ns = wanted, received_ns
-            if repeated or not wanted:
-                return
-            self._request += 1
-            request = self._request
-        self._start(wanted, partial(self._seek_and_go, wanted, request))
+            before, self._object = self._object, wanted
+            idle = self._running == 0
+        if not wanted:
+            return
+        first = before is None and received_ns - self._started_ns < _JUST_STARTED_NS
+        if not _CLASS_NAME.fullmatch(wanted):
+            self._answer(wanted, {"success": False, "reason": f"{name}: expected the name of a class"})
+        elif not self._commands or (not first and wanted != before):
+            self._start(wanted, partial(self._execute, _mission(wanted), wanted))
+        elif idle:
+            self._answer(wanted, {"success": False, "reason": f"{name}: {_REPEATED}"})
 
     def on_command(self, name: str, type_name: str, payload: memoryview, *_: int) -> None:
         """Process a command of the grammar."""
         text = str(decode(type_name, payload)["data"])
-        self._start(text, partial(self._execute, text))
+        self._start(text, partial(self._execute, text, text))
 
     def _start(self, text: str, work: Callable[[], object]) -> None:
         with self._lock:
@@ -133,21 +142,15 @@ class Requests:
 
         Thread(target=run, name="ROS command", daemon=True).start()
 
-    def _seek_and_go(self, wanted: str, request: int) -> None:
-        found = self._execute(f'seek "{wanted}"')
-        if found and request == self._request:
-            self._execute(f'approach "{wanted}"')
-
-    def _execute(self, text: str) -> bool:
-        """Send a command, and publish its outcome. Returns whether it has succeeded."""
+    def _execute(self, command: str, text: str) -> None:
+        """Send a command, and publish its outcome as that of `text`."""
         try:
             reply = send_command(
-                self._session, self._vehicle, text, timeout_s=_TIMEOUT_S, on_silent=self._say
+                self._session, self._vehicle, command, timeout_s=_TIMEOUT_S, on_silent=self._say
             )
         except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
             reply = {"success": False, "reason": str(error)}
         self._answer(text, reply)
-        return bool(reply.get("success"))
 
     def _answer(self, text: str, reply: dict[str, Any]) -> None:
         self._publish_result(encode(STRING, {"data": json.dumps({"command": text[:_SHOWN], **reply})}))
