@@ -22,7 +22,8 @@ from companion.ros2.gateway import NodeTopic
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 _CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
-_JUST_STARTED_NS = 5_000_000_000
+_JUST_STARTED_NS, _REPETITION_NS = 5_000_000_000, 10_000_000_000
+_AGAIN = "the same text within 10 s is no new command; publish it --once"
 _REPEATED = "the same text again is no new request; publish an empty one before it"
 _SHOWN = 200  # characters of a command in its outcome
 # A mission takes so long.
@@ -70,6 +71,7 @@ class Requests:
         self._lock, self._running = Lock(), 0
         self._object: str | None = None  # the newest that was received
         self._started_ns = time.monotonic_ns()
+        self._command, self._command_ns = "", 0  # the newest that was received, and when
 
     def topics(self) -> tuple[NodeTopic, ...]:
         """Return what a node subscribes to, and the topic of the outcomes."""
@@ -117,10 +119,21 @@ class Requests:
         elif idle:
             self._answer(wanted, {"success": False, "reason": f"{name}: {_REPEATED}"})
 
-    def on_command(self, name: str, type_name: str, payload: memoryview, *_: int) -> None:
-        """Process a command of the grammar."""
+    def on_command(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+        """Process a command of the grammar.
+
+        `ros2 topic pub` repeats a message at 1 Hz unless it is given `--once`. So the same text less than
+        10 s after it was received last is no new request, except `stop`.
+        """
         text = str(decode(type_name, payload)["data"])
-        self._start(text, partial(self._execute, text, text))
+        with self._lock:
+            again = text == self._command and received_ns - self._command_ns < _REPETITION_NS
+            self._command, self._command_ns = text, received_ns
+            idle = self._running == 0
+        if not again or text.strip() == "stop" or not self._commands:
+            self._start(text, partial(self._execute, text, text))
+        elif idle:
+            self._answer(text, {"success": False, "reason": f"{name}: {_AGAIN}"})
 
     def _start(self, text: str, work: Callable[[], object]) -> None:
         with self._lock:

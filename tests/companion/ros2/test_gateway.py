@@ -264,6 +264,22 @@ def test_repeated_object_does_not_take_the_vehicle_back(bus: BusSide, requests: 
 
 
 @pytest.mark.realtime
+def test_repeated_command_is_one_command_but_stop_is_always_one(bus: BusSide, requests: Any) -> None:
+    made, results = requests
+    begin_ns = later_ns()
+    for text, seconds, commands in (
+        ("seek car", range(30), 1),
+        ("seek car", (45,), 2),
+        ("stop", (46, 47), 4),
+    ):
+        for second in seconds:
+            made.on_command("~/command", STRING, text_of(text), begin_ns + second * 10**9, 0)
+            assert results.get(timeout=WAIT_S)["command"] == text
+            wait_until(lambda: made._running == 0)
+        assert bus.received == commands
+
+
+@pytest.mark.realtime
 def test_object_repeated_since_before_the_start_is_no_request(bus: BusSide, requests: Any) -> None:
     made, results = requests
     for _ in range(3):
