@@ -5,5 +5,5 @@ class RecordingError(ValueError):
     """A recording cannot be written, read or served. The message is one line."""
 
 
-# Beginnings of what the recorder and the live server say.
-RECORDING, RECORDED, PAUSED, LISTENING = "recording to ", "recorded ", "paused: ", "open "
+# Beginnings of what the recorder says when all is well.
+RECORDING, RECORDED = "recording to ", "recorded "

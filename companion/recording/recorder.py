@@ -16,11 +16,12 @@ from typing import Any
 import zenoh
 from typing_extensions import TypedDict
 
+from companion.bus.child_client import PAUSED
 from companion.bus.client import message_of, open_client, subscribe_kept
 from companion.bus.topics import CLOUD, DEPTH_IMAGE, IMAGE, MAVLINK, RECORDER_TOPICS, ROOT, TOPICS, Topic
 from companion.host.peer_data import PeerDataError
 from companion.host.scheduling import lower_priority
-from companion.recording import PAUSED, RECORDED, RECORDING, RecordingError
+from companion.recording import RECORDED, RECORDING, RecordingError
 from companion.recording.convert import RECORDER_CHANNEL, RUN_CHANNEL, Converter, stored_schema
 from companion.recording.files import FLUSH_S, Channel, Recorded, RecordingWriter
 from companion.settings import ZenohSection

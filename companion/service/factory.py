@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
+from companion.bus.child_client import LISTENING, PAUSED
 from companion.bus.client import NoAnswerError, settings_for_child
 from companion.bus.config import BusError
 from companion.bus.topics import IMAGE
@@ -19,7 +20,7 @@ from companion.guidance.limits.envelope import Limits
 from companion.guidance.limits.obstacles import ObstacleRules
 from companion.host.child_process import child_process
 from companion.perception.cameras import recorded_frames_names
-from companion.recording import LISTENING, PAUSED, RECORDED, RECORDING
+from companion.recording import RECORDED, RECORDING
 from companion.settings import CameraSection, Settings
 from companion.settings.vehicle import COMPONENT_IDS
 from companion.vehicle.driver import Driver, OnBytes
@@ -30,9 +31,18 @@ from companion.vehicle.streamer import Streamer
 
 # Beginnings of the lines that its clients print when all is well.
 _ROUTINE = (RECORDING, RECORDED, LISTENING)
-# With low priority on a busy computer the recorder takes seconds to finish its file.
-_END_S = {"recorder": 20.0, "foxglove": 5.0, "ros2": 5.0}
-_MODULES = {"recorder": "companion.recording", "foxglove": "companion.recording", "ros2": "companion.ros2"}
+
+
+class _Client(NamedTuple):
+    """A client of the bus that the service starts: `python -m MODULE`, with options.
+
+    Attributes:
+        end_s: it is killed if it takes longer to end, seconds.
+    """
+
+    module: str
+    options: dict[str, Any]
+    end_s: float = 5.0
 
 
 def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
@@ -108,6 +118,24 @@ def limits_of(settings: Settings) -> Limits:
     )
 
 
+def _clients(settings: Settings) -> Iterator[tuple[str, _Client]]:
+    """Yield the clients that are set, by their names."""
+    if settings.recording.directory:
+        recording = settings.recording
+        options = recording.model_dump(include={"directory", "max_file_mb", "max_total_mb"})
+        options |= {"images": recording.images}
+        options |= {kind: kind in recording.content for kind in ("depth", "clouds")}
+        options["frames"] = {
+            IMAGE.path(camera): name for camera, name in recorded_frames_names(settings).items()
+        }
+        # With low priority on a busy computer it takes seconds to finish its file.
+        yield "recorder", _Client("companion.recording", options, end_s=20.0)
+    if settings.foxglove.listen is not None:
+        yield "foxglove", _Client("companion.recording", settings.foxglove.model_dump())
+    if settings.ros2.rmw_zenoh or settings.ros2.plain_keys:
+        yield "ros2", _Client("companion.ros2", {"settings": settings.ros2.model_dump(mode="json")})
+
+
 @asynccontextmanager
 async def clients_of(
     settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str, bool], None]
@@ -119,19 +147,6 @@ async def clients_of(
         on_state: called with a client's name, why it does not work (empty: it does), and whether it is
             tried again.
     """
-    programs: dict[str, dict[str, Any]] = {}
-    if settings.recording.directory:
-        recording = settings.recording
-        programs["recorder"] = recording.model_dump(include={"directory", "max_file_mb", "max_total_mb"})
-        programs["recorder"] |= {"images": recording.images}
-        programs["recorder"] |= {kind: kind in recording.content for kind in ("depth", "clouds")}
-        programs["recorder"]["frames"] = {
-            IMAGE.path(camera): name for camera, name in recorded_frames_names(settings).items()
-        }
-    if settings.foxglove.listen is not None:
-        programs["foxglove"] = settings.foxglove.model_dump()
-    if settings.ros2.rmw_zenoh or settings.ros2.plain_keys:
-        programs["ros2"] = {"settings": settings.ros2.model_dump(mode="json")}
 
     def say(line: str) -> None:
         name, _, text = line.partition(": ")
@@ -141,7 +156,7 @@ async def clients_of(
             on_state(name, "" if well else text, True)
 
     async with AsyncExitStack() as stack:
-        for name, options in programs.items():
+        for name, client in _clients(settings):
             on_state(name, "it is starting", True)
             try:
                 zenoh = settings_for_child(settings.zenoh)
@@ -149,14 +164,14 @@ async def clients_of(
                 say(f"{name}: {error}")
                 on_state(name, str(error), False)
                 continue
-            argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **options})
+            argument = json.dumps({"zenoh": zenoh, "vehicle": settings.vehicle.name, **client.options})
             program = child_process(
                 name,
-                _MODULES[name],
+                client.module,
                 argument,
                 say,
                 on_end=partial(on_state, name),
-                end_s=_END_S[name],
+                end_s=client.end_s,
             )
             await stack.enter_async_context(program)
         yield

@@ -11,7 +11,8 @@ from threading import Event
 import pytest
 import zenoh
 
-from companion.recording import PAUSED, RECORDED, RECORDING, RecordingError, recorder
+from companion.bus.child_client import PAUSED
+from companion.recording import RECORDED, RECORDING, RecordingError, recorder
 from companion.recording import files as recording_files
 from companion.recording.files import KEPT_FREE_BYTES, RecordingReader
 from companion.recording.recorder import RecorderOptions, record

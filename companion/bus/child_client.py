@@ -1,0 +1,113 @@
+"""The beginning and the end of the clients that the service starts: `python -m PACKAGE OPTIONS`, as JSON.
+
+Such a client ends with its parent. It prints lines for the operator, of which those with the beginnings below
+say whether it works.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from threading import Event
+from typing import Any
+
+from zenoh import Session
+
+from companion.bus.client import NoAnswerError, open_client, settings_in_child
+from companion.bus.config import BusError
+from companion.host.child_process import EXIT_REFUSED, on_parent_end
+from companion.host.passing import EXIT_PASSING, PassingError
+from companion.settings import ZenohSection
+from vision.extras import missing_module
+
+LISTENING, PAUSED = "open ", "paused: "
+"""Beginnings of a line: it works; it does not now, and why."""
+
+_RETRY_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class ChildClient:
+    """What such a client is given.
+
+    Attributes:
+        zenoh: settings of a client of the service's bus.
+        options: the others, as given to `options_of_child`.
+        ending: set when it is to end, from a thread.
+    """
+
+    zenoh: ZenohSection
+    options: dict[str, Any]
+    ending: Event = field(default_factory=Event)
+
+    def say(self, text: str) -> None:
+        """Print a line, from any thread."""
+        print(text, flush=True)
+
+    @contextmanager
+    def open_bus(self) -> Iterator[Session | None]:
+        """Open the service's bus, however late it comes; None: it was to end before."""
+        with open_patiently(self.zenoh, self.ending, self.say) as session:
+            yield session
+
+
+@contextmanager
+def open_patiently(
+    section: ZenohSection, ending: Event, say: Callable[[str], None], missing: str = ""
+) -> Iterator[Session | None]:
+    """Open a session that is connected to a node, however late that comes; None: `ending` was set before.
+
+    Args:
+        missing: why there is none, for people; empty: as `open_client` says it.
+    """
+    said = False
+    while not ending.is_set():
+        opening = open_client(section, timeout_s=0.0)
+        try:
+            session = opening.__enter__()
+        except NoAnswerError as error:
+            if not said:
+                say(f"{PAUSED}{missing or error}; retrying")
+            said = True
+            ending.wait(_RETRY_S)
+            continue
+        try:
+            yield session
+        finally:
+            opening.__exit__(None, None, None)
+        return
+    yield None
+
+
+def run_child(
+    argument: str, work: Callable[[ChildClient], None], refused: tuple[type[Exception], ...] = ()
+) -> int:
+    """Run such a client until its end; returns the exit code of its process.
+
+    Args:
+        argument: the first one of the command line.
+        refused: errors, beside those of the bus and of missing packages, that another start would meet again.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, as a closed terminal is
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    options = json.loads(argument)
+    client = ChildClient(settings_in_child(options.pop("zenoh")), options)
+    on_parent_end(client.ending.set)
+    try:
+        work(client)
+    except ModuleNotFoundError as error:
+        client.say(missing_module(error) or str(error))
+        return EXIT_REFUSED
+    except (PassingError, NoAnswerError) as error:  # or the node has gone since
+        client.say(str(error))
+        return EXIT_PASSING
+    except BusError as error:
+        client.say(str(error))
+        return EXIT_REFUSED
+    except refused as error:
+        client.say(str(error))
+        return EXIT_REFUSED
+    return 0
