@@ -10,24 +10,19 @@ from __future__ import annotations
 import hashlib
 import hmac
 import ipaddress
-import os
 import socket
-import stat
-from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
 from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.settings.key_files import KeyFileError, check_private
-from vision.file_kinds import open_file
+from companion.settings.key_files import KeyFileError, read_secret
 
 HEADER = "x-companion-dashboard"
 """A POST needs it, with any value: a page of another origin cannot send it without a CORS permission."""
 COOKIE = "companion_dashboard"
 SHORTEST_TOKEN = 16
-_LONGEST_FILE_BYTES = 1024
 
 
 class DashboardError(RuntimeError):
@@ -58,25 +53,12 @@ def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
     Raises:
         DashboardError: the file or its content is not acceptable. The message never contains the token.
     """
-    path = Path(path)
     try:
-        with open_file(path) as file:
-            status = os.fstat(file.fileno())
-            content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
-    except OSError as error:
-        raise DashboardError(f"{name} {path}: cannot be read: {error.strerror}") from error
-    try:
-        check_private(path, status)
+        token = read_secret(Path(path), name, shortest=SHORTEST_TOKEN)
     except KeyFileError as error:
-        raise DashboardError(f"{name} {error}") from None
-    token = content.removeprefix(BOM_UTF8).decode("ascii", "replace").strip()
-    if len(content) > _LONGEST_FILE_BYTES or not token.isprintable() or " " in token or "\ufffd" in token:
+        raise DashboardError(str(error)) from error
+    if " " in token:
         raise DashboardError(f"{name} {path}: expected one line of ASCII without spaces")
-    if len(token) < SHORTEST_TOKEN:
-        raise DashboardError(
-            f"{name} {path}: expected at least {SHORTEST_TOKEN} characters, got {len(token)}; "
-            f"for example: openssl rand -hex 16 > {path}"
-        )
     return token
 
 

@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from companion.language.tools import MAX_CALLS, ToolCall, arguments_of, calls_of
 from companion.settings import LanguageSection
-from companion.settings.key_files import KeyFileError, check_private
+from companion.settings.key_files import KeyFileError, read_secret
 from vision.extras import install_command
-from vision.file_kinds import kind_of_bytes, open_file
 from vision.redaction import redacted
-from vision.text_file import decode_text
 
 if TYPE_CHECKING:
     import httpx
@@ -84,23 +82,11 @@ def endpoint_from(language: LanguageSection) -> Endpoint | None:
 
 
 def read_api_key(path: Path) -> str:
-    """Read `language.key_file`, a text that only its owner can read. Raises LanguageError."""
+    """Read `language.key_file`. Raises LanguageError."""
     try:
-        check_private(path, path.stat())
-        with open_file(path) as file:
-            content = file.read()
-        if (kind := kind_of_bytes(content)) is not None:
-            raise LanguageError(f"language.key_file {path}: {kind}")
-        key = decode_text(content).strip()
-        if not key.isascii() or not key.isprintable():  # it becomes a line of HTTP
-            raise LanguageError(f"language.key_file {path}: expected a line of ASCII text")
-        return key
+        return read_secret(path, "language.key_file", shortest=0)
     except KeyFileError as error:
-        raise LanguageError(f"language.key_file {error}") from None
-    except OSError as error:
-        raise LanguageError(f"language.key_file {path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise LanguageError(f"language.key_file {path}: expected a line of text") from None
+        raise LanguageError(str(error)) from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import os
 import stat
+from codecs import BOM_UTF8
 from pathlib import Path
+
+from vision.file_kinds import open_file
+
+_LONGEST_FILE_BYTES = 4 * 1024
 
 
 class KeyFileError(ValueError):
-    """Others can read a secret. The message is one line, without the name of what the file is for."""
+    """A secret cannot be used. The message is one line; it never contains the secret."""
 
 
 def check_private(path: Path, status: os.stat_result) -> None:
@@ -16,3 +21,33 @@ def check_private(path: Path, status: os.stat_result) -> None:
     if status.st_mode & 0o077:
         mode = stat.S_IMODE(status.st_mode)
         raise KeyFileError(f"{path}: others can read it (mode {mode:o}): chmod 600 {path}")
+
+
+def read_secret(path: Path, name: str, *, shortest: int = 1) -> str:
+    """Read a secret of one line: printable ASCII, in a file that only its owner can read.
+
+    Args:
+        name: of the setting, for errors. shortest: characters.
+
+    Raises:
+        KeyFileError: the file or its content is not acceptable.
+    """
+    try:
+        with open_file(path) as file:
+            status = os.fstat(file.fileno())
+            content = file.read(_LONGEST_FILE_BYTES + 1) if stat.S_ISREG(status.st_mode) else b""
+    except OSError as error:
+        raise KeyFileError(f"{name} {path}: cannot be read: {error.strerror}") from error
+    try:
+        check_private(path, status)
+    except KeyFileError as error:
+        raise KeyFileError(f"{name} {error}") from None
+    secret = content.removeprefix(BOM_UTF8).decode("ascii", "replace").strip()
+    if len(content) > _LONGEST_FILE_BYTES or not secret.isprintable() or "\ufffd" in secret:
+        raise KeyFileError(f"{name} {path}: expected one line of ASCII")
+    if len(secret) < shortest:
+        raise KeyFileError(
+            f"{name} {path}: expected at least {shortest} characters, got {len(secret)}; "
+            f"for example: openssl rand -hex 16 > {path}"
+        )
+    return secret
