@@ -1,4 +1,4 @@
-"""The beginning and the end of the clients that the service starts: `python -m PACKAGE OPTIONS`, as JSON.
+"""The beginning and the end of the clients that the service starts: `python -m PACKAGE`, options as JSON.
 
 Such a client ends with its parent. It prints lines for the operator, of which those with the beginnings below
 say whether it works.
@@ -6,19 +6,20 @@ say whether it works.
 
 from __future__ import annotations
 
+import asyncio
 import json
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 from zenoh import Session
 
 from companion.bus.client import NoAnswerError, open_client, settings_in_child
 from companion.bus.config import BusError
-from companion.host.child_process import EXIT_REFUSED, on_parent_end
+from companion.host.child_process import EXIT_REFUSED, on_parent_end, read_options
 from companion.host.passing import EXIT_PASSING, PassingError
 from companion.settings import ZenohSection
 from vision.extras import missing_module
@@ -35,7 +36,7 @@ class ChildClient:
 
     Attributes:
         zenoh: settings of a client of the service's bus.
-        options: the others, as given to `options_of_child`.
+        options: the others, of its package.
         ending: set when it is to end, from a thread.
     """
 
@@ -46,6 +47,18 @@ class ChildClient:
     def say(self, text: str) -> None:
         """Print a line, from any thread."""
         print(text, flush=True)
+
+    async def ended(self) -> None:
+        """Wait in an asyncio loop until it is to end."""
+        loop, ended = asyncio.get_running_loop(), asyncio.Event()
+
+        def wait() -> None:
+            self.ending.wait()
+            with suppress(RuntimeError):  # the loop has ended before
+                loop.call_soon_threadsafe(ended.set)
+
+        Thread(target=wait, name="ending", daemon=True).start()
+        await ended.wait()
 
     @contextmanager
     def open_bus(self) -> Iterator[Session | None]:
@@ -82,18 +95,15 @@ def open_patiently(
     yield None
 
 
-def run_child(
-    argument: str, work: Callable[[ChildClient], None], refused: tuple[type[Exception], ...] = ()
-) -> int:
+def run_child(work: Callable[[ChildClient], None], refused: tuple[type[Exception], ...] = ()) -> int:
     """Run such a client until its end; returns the exit code of its process.
 
     Args:
-        argument: the first one of the command line.
         refused: errors, beside those of the bus and of missing packages, that another start would meet again.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, as a closed terminal is
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    options = json.loads(argument)
+    options = json.loads(read_options())
     client = ChildClient(settings_in_child(options.pop("zenoh")), options)
     on_parent_end(client.ending.set)
     try:

@@ -1,4 +1,4 @@
-"""The dashboard as a child process: `python -m companion.dashboard`, options as JSON in the argument.
+"""The dashboard as a child process: `python -m companion.dashboard`, options as JSON.
 
 It prints the page's address, or one line why there is none now, or never. It ends with its parent.
 """
@@ -14,16 +14,16 @@ from companion.bus.client import settings_in_child
 from companion.bus.config import BusError
 from companion.dashboard.access import DashboardError
 from companion.dashboard.server import NICENESS, DashboardOptions, serve
-from companion.host.child_process import EXIT_REFUSED, on_parent_end
+from companion.host.child_process import EXIT_REFUSED, on_parent_end, read_options
 from companion.host.passing import EXIT_PASSING, PassingError
 from companion.host.scheduling import lower_priority
 from companion.settings import LanguageSection
 
 
-def main(argument: str) -> int:
+def main() -> int:
     """Serve; returns the exit code."""
     lower_priority(NICENESS)
-    values = json.loads(argument)
+    values = json.loads(read_options())
     zenoh = settings_in_child(values.pop("zenoh"))
     language = LanguageSection.model_validate_json(json.dumps(values.pop("language")))
     plugins = tuple(values.pop("plugins"))
@@ -38,4 +38,4 @@ def main(argument: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main())

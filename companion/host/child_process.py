@@ -1,7 +1,8 @@
 """Programs beside the service, each in its own process: modules of ours, and ROS's node.
 
 Nothing in such a program can delay the service. It ends when its standard input is closed, which the parent
-holds: at the end of the context, and when the parent is killed.
+holds: at the end of the context, and when the parent is killed. A module's options are the first line of that
+input: other users of the computer can read a command line.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ Start = Callable[[], Awaitable[tuple[Process, Callable[[], None]]]]
 def child_process(
     name: str,
     module: str,
-    argument: str,
+    options: str,
     say: Say,
     *,
     on_end: OnEnd = lambda _why, _again: None,
     end_s: float = _END_S,
 ) -> AbstractAsyncContextManager[None]:
-    """Run `python -m MODULE ARGUMENT` meanwhile, as `supervised`."""
-    return supervised(name, partial(_start_module, module, argument), say, on_end=on_end, end_s=end_s)
+    """Run `python -m MODULE` meanwhile, as `supervised`. `options`: one line, for `read_options`."""
+    return supervised(name, partial(_start_module, name, module, options), say, on_end=on_end, end_s=end_s)
 
 
 @asynccontextmanager
@@ -102,13 +103,13 @@ async def _supervise(name: str, start: Start, say: Say, on_end: OnEnd, end_s: fl
         await asyncio.sleep(restart.pause_s)
 
 
-async def _start_module(module: str, argument: str) -> tuple[Process, Callable[[], None]]:
+async def _start_module(name: str, module: str, options: str) -> tuple[Process, Callable[[], None]]:
     process = await asyncio.create_subprocess_exec(
         sys.executable,
         "-P",  # import from the search path below, not from the working directory
         "-m",
         module,
-        argument,
+        name,  # for `ps`
         stdin=PIPE,
         stdout=PIPE,
         stderr=STDOUT,
@@ -117,6 +118,7 @@ async def _start_module(module: str, argument: str) -> tuple[Process, Callable[[
         process_group=0,
     )
     assert process.stdin is not None
+    process.stdin.write(options.encode() + b"\n")
     return process, process.stdin.close
 
 
@@ -152,6 +154,17 @@ async def _ended(process: Process, within_s: float) -> bool:
         async with asyncio.timeout(within_s):
             await process.wait()
     return process.returncode is not None
+
+
+def read_options() -> str:
+    """In the program: read the options, before `on_parent_end`. It ends here if the parent has gone."""
+    options = b""
+    while not options.endswith(b"\n"):
+        part = os.read(sys.stdin.fileno(), 1)
+        if not part:
+            sys.exit(0)
+        options += part
+    return options.decode()
 
 
 def on_parent_end(call: Callable[[], None]) -> None:

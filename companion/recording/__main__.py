@@ -1,4 +1,4 @@
-"""The clients that the service starts: `python -m companion.recording OPTIONS`, as JSON.
+"""The clients that the service starts: `python -m companion.recording`, options as JSON.
 
 With `listen` it serves Foxglove live (`live.py`), else it records (`recorder.py`).
 """
@@ -27,4 +27,4 @@ def _work(client: ChildClient) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(run_child(sys.argv[1], _work, refused=(RecordingError,)))
+    sys.exit(run_child(_work, refused=(RecordingError,)))

@@ -1,4 +1,4 @@
-"""The nodes on zenoh that the service starts: `python -m companion.ros2 OPTIONS`, as JSON."""
+"""The nodes on zenoh that the service starts: `python -m companion.ros2`, options as JSON."""
 
 from __future__ import annotations
 
@@ -91,4 +91,4 @@ def _other(session: zenoh.Session) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(run_child(sys.argv[1], _work, refused=(_DomainError,)))
+    sys.exit(run_child(_work, refused=(_DomainError,)))
