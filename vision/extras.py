@@ -7,6 +7,7 @@ from __future__ import annotations
 
 EXTRA_OF = {
     "aioconsole": "service",
+    "aiomqtt": "mqtt",
     "av": "cameras",
     "cuda": "nvidia",
     "depthai": "cameras",

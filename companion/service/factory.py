@@ -134,6 +134,9 @@ def _clients(settings: Settings) -> Iterator[tuple[str, _Client]]:
         yield "foxglove", _Client("companion.recording", settings.foxglove.model_dump())
     if settings.ros2.rmw_zenoh or settings.ros2.plain_keys:
         yield "ros2", _Client("companion.ros2", {"settings": settings.ros2.model_dump(mode="json")})
+    if settings.mqtt.url is not None or settings.mqtt.webhooks:
+        options = {"mqtt": settings.mqtt.model_dump(mode="json"), "cameras": list(settings.cameras)}
+        yield "mqtt", _Client("companion.mqtt", options)
 
 
 @asynccontextmanager

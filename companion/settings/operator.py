@@ -11,6 +11,10 @@ from companion.settings.section import Section
 from companion.settings.texts import (
     HOST_AND_PORT,
     HOST_AND_PORT_OR_EMPTY,
+    HTTP_URL,
+    MQTT_PREFIX,
+    MQTT_PREFIX_OR_EMPTY,
+    MQTT_URL,
     ROS_NAME,
     ROS_NAMESPACE,
     ZenohEndpoint,
@@ -74,6 +78,27 @@ class Ros2Section(Section):
     """zenoh router of rmw_zenoh and of the bridge; not an endpoint of zenoh.listen"""
     plain_keys: bool = False
     """the same on the keys of zenoh-bridge-ros2dds"""
+
+
+class MqttSection(Section):
+    """Events of objects, the vehicle's state and Home Assistant by MQTT; events by webhooks. Extra `mqtt`."""
+
+    url: Annotated[str | None, MQTT_URL] = None
+    """broker, such as mqtt://192.168.1.5:1883, or mqtts:// for TLS; unset: none"""
+    username: str | None = None
+    """of the broker"""
+    password_file: str | None = None
+    """file with the password, readable by its owner only"""
+    ca_file: str | None = None
+    """certificates that sign the broker's, PEM; unset: the system's"""
+    prefix: Annotated[str, MQTT_PREFIX] = "companion"
+    """first part of the topics; the vehicle's name is the second"""
+    discovery_prefix: Annotated[str, MQTT_PREFIX_OR_EMPTY] = "homeassistant"
+    """where Home Assistant looks for devices; empty: no discovery"""
+    commands: bool = False
+    """execute what is published on PREFIX/NAME/command: whoever can publish there can fly"""
+    webhooks: tuple[Annotated[str, HTTP_URL], ...] = ()
+    """addresses to which events of objects are posted as JSON"""
 
 
 class MetricsSection(Section):

@@ -14,6 +14,7 @@ from companion.settings.operator import (
     FoxgloveSection,
     LogSection,
     MetricsSection,
+    MqttSection,
     PluginsSection,
     RecordingSection,
     Ros2Section,
@@ -73,6 +74,7 @@ class Settings(Section):
     language: LanguageSection = LanguageSection()
     foxglove: FoxgloveSection = FoxgloveSection()
     ros2: Ros2Section = Ros2Section()
+    mqtt: MqttSection = MqttSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()

@@ -16,6 +16,12 @@ ROS_NAMESPACE = StringConstraints(
     pattern=r"^([A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*)?$", max_length=200
 )
 HTTP_URL = StringConstraints(pattern=r"^https?://[^\s/]+(/\S*)?$", max_length=300)
+# Without a password, which others could read in the command line of the process.
+MQTT_URL = StringConstraints(
+    pattern=r"^mqtts?://([^\s/@:]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?/?$", max_length=300
+)
+MQTT_PREFIX = StringConstraints(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)
+MQTT_PREFIX_OR_EMPTY = StringConstraints(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$", max_length=200)
 HOST_AND_PORT_OR_EMPTY = StringConstraints(pattern=r"^([^\s:]+:[0-9]{1,5})?$", max_length=300)
 # The same without a dot, since `cameras.NAME.source` is a key.
 CAMERA_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
@@ -43,6 +49,11 @@ PATTERN_MEANINGS = {
     ),
     r"^https?://[^\s/]+(/\S*)?$": "an address such as http://127.0.0.1:11434",
     r"^([^\s:]+:[0-9]{1,5})?$": "HOST:PORT such as 127.0.0.1:8088, or empty",
+    r"^mqtts?://([^\s/@:]+|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?/?$": "an address such as mqtt://192.168.1.5:1883",
+    r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$": "words of letters, digits, `_`, `-` and `.`, separated by `/`",
+    r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$": (
+        "words of letters, digits, `_`, `-` and `.`, separated by `/`; or empty"
+    ),
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial://DEVICE:BAUD or none"

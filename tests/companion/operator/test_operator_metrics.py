@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import queue
+import re
 import socket
 import sys
 import threading
@@ -21,6 +22,9 @@ from mavlink_sim.testing import free_port
 from tests.companion.service_process import heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
+
+
+GRAFANA = Path(__file__).parents[3] / "docs" / "grafana.json"
 
 
 def fetch(port: int) -> dict[str, float]:
@@ -58,6 +62,14 @@ def test_metrics_and_tracks_of_a_running_service(seeing: list[str], tmp_path: Pa
         while not numbers.get('companion_frames_skipped_total{camera="",reason="rate"}'):
             numbers = fetch(port)
     assert numbers["companion_vehicle_armed"] == 0
+    # Every metric of the dashboard of Grafana is there.
+    named = {
+        re.search(r"companion_\w+", target["expr"])[0]  # type: ignore[index]
+        for panel in json.loads(GRAFANA.read_text())["panels"]
+        for target in panel["targets"]
+    }
+    assert len(named) > 10
+    assert named <= {name.partition("{")[0] for name in numbers}
     assert numbers['companion_perception_running{camera=""}'] == 1
     assert numbers['companion_messages_published_total{topic="detections"}'] > 0
     for stage in ("capture", "decode", "wait", "preprocess", "inference", "postprocess", "track", "publish"):

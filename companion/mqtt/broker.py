@@ -1,0 +1,182 @@
+"""The connection to an MQTT broker: kept, opened again, and nothing queued without bound."""
+
+from __future__ import annotations
+
+import asyncio
+import ssl
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+from urllib.parse import urlsplit
+
+import aiomqtt
+
+from companion.bus.child_client import LISTENING, PAUSED
+from companion.host.restarts import Restarts
+from companion.mqtt import MqttError
+from companion.settings.key_files import KeyFileError, read_secret
+from companion.settings.operator import MqttSection
+
+ONLINE, OFFLINE = "online", "offline"
+MOST_EVENTS = 200
+LARGEST_COMMAND_BYTES = 4096
+_KEEPALIVE_S = 15
+_ANSWER_S = 10.0
+_PORTS = {"mqtt": 1883, "mqtts": 8883}
+
+
+@dataclass(frozen=True, slots=True)
+class Broker:
+    """Where the broker is, and how it is reached. `tls`: None without."""
+
+    host: str
+    port: int
+    username: str | None
+    password: str | None
+    tls: ssl.SSLContext | None
+
+    def __str__(self) -> str:
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        return f"{'mqtt' if self.tls is None else 'mqtts'}://{host}:{self.port}"
+
+
+def broker_of(section: MqttSection) -> Broker:
+    """Return the broker of the settings. Raises MqttError: a file or the address cannot be used."""
+    assert section.url is not None
+    parts = urlsplit(section.url)
+    try:
+        port = parts.port or _PORTS[parts.scheme]
+        password = section.password_file and read_secret(Path(section.password_file), "mqtt.password_file")
+        tls = ssl.create_default_context(cafile=section.ca_file) if parts.scheme == "mqtts" else None
+    except KeyFileError as error:
+        raise MqttError(str(error)) from error
+    except ValueError as error:
+        raise MqttError(f"mqtt.url {section.url}: {error}") from error
+    except OSError as error:  # ssl.SSLError too
+        raise MqttError(f"mqtt.ca_file {section.ca_file}: {error.strerror or error}") from error
+    return Broker(parts.hostname or "", port, section.username, password, tls)
+
+
+class BrokerLink:
+    """Sends what is put into it while there is a broker. Everything is called in the asyncio loop.
+
+    Of states the newest of each topic waits; of events `MOST_EVENTS`, while connected only: an event is not
+    reported minutes late. What is left out is counted, and said at the next connection.
+
+    Args:
+        available: topic of `online` and `offline`; the latter is the last will.
+        command: topic to subscribe to; None: none. `on_command` is called with a text that was not retained.
+        say: called with a line.
+    """
+
+    def __init__(
+        self,
+        broker: Broker,
+        available: str,
+        say: Callable[[str], None],
+        command: str | None = None,
+        on_command: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self._broker, self._available, self._say = broker, available, say
+        self._command, self._on_command = command, on_command
+        self._states: dict[str, bytes] = {}  # all that are retained, for a broker that has lost them
+        self._unsent: dict[str, None] = {}
+        self._events: deque[tuple[str, bytes]] = deque()
+        self._connected = False
+        self._left_out = 0
+        self._waiting = asyncio.Event()
+
+    def state(self, topic: str, payload: bytes) -> None:
+        """Publish a retained message; an unsent one of the same topic is replaced."""
+        self._states[topic] = payload
+        self._unsent[topic] = None
+        self._waiting.set()
+
+    def event(self, topic: str, payload: bytes) -> None:
+        """Publish a message that is not retained, or count it."""
+        if not self._connected:
+            self._left_out += 1
+            return
+        self._events.append((topic, payload))
+        while len(self._events) > MOST_EVENTS:
+            self._events.popleft()
+            self._left_out += 1
+        self._waiting.set()
+
+    async def run(self) -> NoReturn:
+        """Keep the connection until cancelled, then say `offline`."""
+        restarts, said, loop = Restarts(), "", asyncio.get_running_loop()
+        while True:
+            since_s = loop.time()
+            try:
+                async with self._connection() as client:
+                    said = ""
+                    self._say(f"{LISTENING}{self._broker}{self._losses()}")
+                    await self._work(client)
+            except* (aiomqtt.MqttError, OSError) as errors:
+                why = str(errors.exceptions[0]).strip() or type(errors.exceptions[0]).__name__
+                if why != said:
+                    self._say(f"{PAUSED}MQTT broker {self._broker}: {why}; retrying")
+                said = why
+            self._left_out += len(self._events)
+            self._events.clear()
+            await asyncio.sleep(restarts.after(loop.time() - since_s).pause_s)
+
+    @asynccontextmanager
+    async def _connection(self) -> AsyncIterator[aiomqtt.Client]:
+        broker = self._broker
+        client = aiomqtt.Client(
+            broker.host,
+            broker.port,
+            username=broker.username,
+            password=broker.password,
+            will=aiomqtt.Will(self._available, OFFLINE, qos=1, retain=True),
+            keepalive=_KEEPALIVE_S,
+            timeout=_ANSWER_S,
+            tls_context=broker.tls,
+            max_queued_incoming_messages=MOST_EVENTS,
+        )
+        async with client:
+            self._unsent = dict.fromkeys(self._states)
+            self._connected = True
+            self._waiting.set()
+            try:
+                yield client
+            except asyncio.CancelledError:
+                with suppress(aiomqtt.MqttError, TimeoutError):  # the will says it then
+                    async with asyncio.timeout(1.0):
+                        await client.publish(self._available, OFFLINE, qos=1, retain=True)
+                raise
+            finally:
+                self._connected = False
+
+    async def _work(self, client: aiomqtt.Client) -> None:
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self._send(client))
+            if self._command is not None:
+                await client.subscribe(self._command, qos=0)  # a command is never delivered twice
+            async for message in client.messages:
+                payload = message.payload
+                if message.retain or not isinstance(payload, bytes) or len(payload) > LARGEST_COMMAND_BYTES:
+                    self._say(f"{message.topic}: a message that is retained or too large is no command")
+                    continue
+                self._on_command(payload.decode(errors="replace"))
+
+    async def _send(self, client: aiomqtt.Client) -> None:
+        while True:
+            await self._waiting.wait()
+            self._waiting.clear()
+            while self._unsent or self._events:
+                if self._unsent:
+                    topic = next(iter(self._unsent))
+                    del self._unsent[topic]
+                    await client.publish(topic, self._states[topic], qos=1, retain=True)
+                if self._events:
+                    await client.publish(*self._events.popleft(), qos=1)
+
+    def _losses(self) -> str:
+        count, self._left_out = self._left_out, 0
+        return f" ({count} events were not sent)" if count else ""

@@ -1,0 +1,188 @@
+"""The link to a broker: what it sends, what it leaves out while there is none, what it refuses."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import socket
+import subprocess
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack, ExitStack
+from pathlib import Path
+
+import aiomqtt
+import pytest
+
+from companion.mqtt import MqttError, broker
+from companion.mqtt.broker import MOST_EVENTS, BrokerLink, broker_of
+from companion.settings.operator import MqttSection
+from mavlink_sim.testing import free_port
+from tests.companion.mqtt import mosquitto
+
+pytestmark = [pytest.mark.realtime, pytest.mark.needs("mosquitto")]
+
+AVAILABLE, STATE, EVENTS, COMMAND = "c/v/available", "c/v/state", "c/v/objects", "c/v/command"
+WAIT_S = 20.0
+
+
+class Said:
+    """Lines of the link, to wait for."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._changed = asyncio.Event()
+
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+        self._changed.set()
+
+    async def wait(self, text: str, count: int = 1) -> str:
+        async with asyncio.timeout(WAIT_S):
+            while len(found := [line for line in self.lines if text in line]) < count:
+                self._changed.clear()
+                await self._changed.wait()
+        return found[-1]
+
+
+async def next_of(client: aiomqtt.Client, topic: str) -> tuple[str, bool]:
+    async with asyncio.timeout(WAIT_S):
+        async for message in client.messages:
+            if str(message.topic) == topic and isinstance(message.payload, bytes):
+                return message.payload.decode(), message.retain
+    raise AssertionError
+
+
+def with_link(
+    work: Callable[[BrokerLink, Said, list[str]], Awaitable[None]], port: int, **more: str | None
+) -> list[str]:
+    """Run a link meanwhile; returns its lines. The third argument gets its commands."""
+
+    async def run() -> list[str]:
+        said, commands = Said(), list[str]()
+        section = MqttSection(url=f"mqtt://127.0.0.1:{port}", **more)  # type: ignore[arg-type]
+        link = BrokerLink(broker_of(section), AVAILABLE, said.say, COMMAND, commands.append)
+        running = asyncio.create_task(link.run())
+        try:
+            await work(link, said, commands)
+        finally:
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        return said.lines
+
+    return asyncio.run(run())
+
+
+def station(port: int, **more: str) -> aiomqtt.Client:
+    return aiomqtt.Client("127.0.0.1", port, **more)  # type: ignore[arg-type]
+
+
+def test_states_are_retained_events_are_not_and_the_end_is_said(tmp_path: Path) -> None:
+    async def work(link: BrokerLink, said: Said, _: list[str]) -> None:
+        await said.wait("open mqtt://")
+        async with station(port) as before:
+            await before.subscribe("c/#")
+            link.state(AVAILABLE, b"online")
+            link.state(STATE, b"1")
+            link.event(EVENTS, "schöne Kuh".encode())
+            assert await next_of(before, EVENTS) == ("schöne Kuh", False)
+        after = await stack.enter_async_context(station(port))
+        await after.subscribe("c/#")
+        assert await next_of(after, STATE) == ("1", True)
+        ended.append(after)
+
+    async def run() -> None:
+        async with stack:
+            said = Said()
+            link = BrokerLink(broker_of(MqttSection(url=f"mqtt://127.0.0.1:{port}")), AVAILABLE, said.say)
+            running = asyncio.create_task(link.run())
+            await work(link, said, [])
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+            while (await next_of(ended[0], AVAILABLE))[0] != "offline":
+                pass
+
+    port, stack, ended = free_port(socket.SOCK_STREAM), AsyncExitStack(), list[aiomqtt.Client]()
+    with mosquitto.broker(port, tmp_path):
+        asyncio.run(run())
+
+
+@pytest.mark.parametrize("how", ["killed", "stopped"])
+def test_events_without_a_broker_are_counted_not_queued(
+    how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(broker, "_ANSWER_S", 1.0)
+    port, processes = free_port(socket.SOCK_STREAM), list[subprocess.Popen[bytes]]()
+
+    async def work(link: BrokerLink, said: Said, _: list[str]) -> None:
+        await said.wait("open mqtt://")
+        if how == "killed":
+            processes[0].kill()
+        else:
+            os.kill(processes[0].pid, signal.SIGSTOP)
+            for number in range(3 * MOST_EVENTS):  # what can wait is bounded
+                link.event(EVENTS, str(number).encode())
+        assert f"mqtt://127.0.0.1:{port}" in await said.wait("paused: ")
+        for number in range(500):
+            link.event(EVENTS, str(number).encode())
+            link.state(STATE, str(number).encode())
+        with ExitStack() as stack:
+            if how == "killed":
+                stack.enter_context(mosquitto.broker(port, tmp_path))
+            else:
+                os.kill(processes[0].pid, signal.SIGCONT)
+            line = await said.wait("open mqtt://", 2)
+            # Of those in time some were on the way.
+            lost = int(line.split("(")[1].split()[0])
+            assert lost == 500 if how == "killed" else 500 + 2 * MOST_EVENTS < lost <= 500 + 3 * MOST_EVENTS
+            async with station(port) as client:
+                await client.subscribe(STATE)
+                assert await next_of(client, STATE) == ("499", True)
+
+    with mosquitto.broker(port, tmp_path) as process:
+        processes.append(process)
+        lines = with_link(work, port)
+    assert sum("paused: " in line for line in lines) <= 3  # the same reason is said once
+
+
+def test_a_retained_or_large_message_is_no_command(tmp_path: Path) -> None:
+    port = free_port(socket.SOCK_STREAM)
+
+    async def work(_: BrokerLink, said: Said, commands: list[str]) -> None:
+        await said.wait("open mqtt://")
+        async with station(port) as client:
+            await client.publish(COMMAND, "x" * 5000)
+            await said.wait(COMMAND, 2)
+            await client.publish(COMMAND, "stop")
+            async with asyncio.timeout(WAIT_S):
+                while not commands:
+                    await asyncio.sleep(0.01)
+        assert commands == ["stop"]
+
+    with mosquitto.broker(port, tmp_path):
+
+        async def retain() -> None:
+            async with station(port) as client:
+                await client.publish(COMMAND, "takeoff", qos=1, retain=True)
+
+        asyncio.run(retain())
+        with_link(work, port)
+
+
+def test_a_wrong_password_is_said_and_never_shown(tmp_path: Path) -> None:
+    port, secret = free_port(socket.SOCK_STREAM), tmp_path / "secret"
+    secret.write_text("a wrong password\n")
+    secret.chmod(0o600)
+
+    async def work(_: BrokerLink, said: Said, __: list[str]) -> None:
+        assert "uthori" in await said.wait("paused: ")
+
+    with mosquitto.broker(port, tmp_path, "allow_anonymous false"):
+        lines = with_link(work, port, username="drone", password_file=str(secret))
+    assert not any("wrong password" in line for line in lines)
+
+
+@pytest.mark.parametrize("name", ["password_file", "ca_file"])
+def test_a_missing_file_is_refused_by_its_setting(name: str, tmp_path: Path) -> None:
+    with pytest.raises(MqttError, match=f"mqtt.{name} .*/none: "):
+        broker_of(MqttSection(url="mqtts://broker", **{name: str(tmp_path / "none")}))  # type: ignore[arg-type]

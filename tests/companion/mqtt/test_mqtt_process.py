@@ -1,0 +1,180 @@
+"""The service with `mqtt.url`: what a station sees, before and after that process is killed."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import aiomqtt
+import pytest
+import zenoh
+
+from companion.bus.topics import IMAGE, TRACKS
+from mavlink_sim.testing import free_port
+from tests.companion.mqtt import mosquitto
+from tests.companion.service_process import ServiceProcess, heartbeats, running_service
+
+pytestmark = [pytest.mark.realtime, pytest.mark.needs("mosquitto")]
+
+WAIT_S = 30.0
+BASE = "companion/vehicle1"
+
+
+class Station:
+    """A client of the broker with all messages that it received, to wait for."""
+
+    def __init__(self, client: aiomqtt.Client) -> None:
+        self._client = client
+        self.received: list[tuple[str, bytes]] = []
+
+    async def wait(self, topic: str, payload: bytes | None = None) -> bytes:
+        """Return the next message of a topic, or the next with that payload."""
+        async with asyncio.timeout(WAIT_S):
+            async for message in self._client.messages:
+                assert isinstance(message.payload, bytes)
+                self.received.append((str(message.topic), message.payload))
+                if str(message.topic) == topic and payload in (None, message.payload):
+                    return message.payload
+        raise AssertionError
+
+    async def send(self, text: str) -> None:
+        await self._client.publish(f"{BASE}/command", text)
+
+
+@pytest.fixture
+def port() -> int:
+    return free_port(socket.SOCK_STREAM)
+
+
+@pytest.fixture
+def service(
+    request: pytest.FixtureRequest, port: int, filming: list[str], tmp_path: Path
+) -> Iterator[ServiceProcess]:
+    flags = [*filming, "--mqtt-url", f"mqtt://127.0.0.1:{port}", *getattr(request, "param", ())]
+    with (
+        mosquitto.broker(port, tmp_path),
+        heartbeats() as autopilot,
+        running_service(autopilot, flags, cwd=tmp_path) as service,
+    ):
+        yield service
+
+
+def tracks(kind: str) -> bytes:
+    """A message of the service about a cat; this one has no detector."""
+    now_ns = time.monotonic_ns()
+    place = dict.fromkeys(("latitude_deg", "longitude_deg", "altitude_amsl_m", "error_ellipse", "moving"))
+    event = {
+        "event": kind,
+        "stamp_ns": now_ns,
+        "first_ns": now_ns,
+        "last_ns": now_ns,
+        "track_id": 1,
+        "object_id": None,
+        "class_name": "cat",
+        "confidence": 0.9,
+        "xyxy": [0, 0, 8, 8],
+    }
+    frame = {"vehicle": "vehicle1", "camera": None, "width": 16, "height": 16}
+    return json.dumps({**frame, "events": [event | place]}).encode()
+
+
+def put_until_somebody_listens(session: zenoh.Session, kind: str) -> None:
+    publisher = session.declare_publisher(TRACKS.key("vehicle1"))
+    deadline_s = time.monotonic() + WAIT_S
+    while not publisher.matching_status.matching and time.monotonic() < deadline_s:  # type: ignore[attr-defined]
+        time.sleep(0.02)
+    publisher.put(tracks(kind))
+
+
+def pid_of(service: ServiceProcess, module: bytes) -> int:
+    children = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
+    (found,) = (int(pid) for pid in children if module in Path(f"/proc/{pid}/cmdline").read_bytes())
+    return found
+
+
+def with_station(port: int, work: Any) -> None:
+    async def run() -> None:
+        async with aiomqtt.Client("127.0.0.1", port) as client:
+            await client.subscribe("#")
+            await work(Station(client))
+
+    asyncio.run(run())
+
+
+def test_a_station_sees_the_vehicle_its_objects_and_its_end(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        await station.wait(f"{BASE}/available", b"online")
+        state = json.loads(await station.wait(f"{BASE}/state"))
+        assert (state["connected"], state["mode"], state["armed"]) == (True, "hold", False)
+        with service.client() as session:
+            await asyncio.to_thread(put_until_somebody_listens, session, "new")
+            event = json.loads(await station.wait(f"{BASE}/objects"))
+            session.put(TRACKS.key("vehicle1"), tracks("end"))
+            ended = json.loads(await station.wait(f"{BASE}/objects"))
+        assert (event["event"], event["class"], ended["event"]) == ("new", "cat", "end")
+        jpegs = [payload for topic, payload in station.received if topic == f"{BASE}/snapshot"]
+        assert [jpeg[:2] for jpeg in jpegs] == [b"\xff\xd8"]
+        # Not allowed: it is answered by nobody, and said by nobody.
+        await station.send("takeoff")
+        os.kill(pid_of(service, b"companion.mqtt"), signal.SIGKILL)
+        killed_s = time.monotonic()
+        await station.wait(f"{BASE}/available", b"offline")
+        assert time.monotonic() - killed_s < 5.0  # the last will
+        await station.wait(f"{BASE}/available", b"online")
+        await asyncio.to_thread(service.stop)
+        await station.wait(f"{BASE}/available", b"offline")
+        assert not any(topic == f"{BASE}/result" for topic, _ in station.received)
+
+    with_station(port, work)
+    assert any("mqtt: its process ended" in line for line in service.last_lines())
+
+
+def test_discovery_names_only_topics_and_values_that_come(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        device = json.loads(await station.wait("homeassistant/device/companion_vehicle1/config"))
+        state = json.loads(await station.wait(f"{BASE}/state"))
+        entities = device["components"].values()
+        assert device["availability_topic"] == f"{BASE}/available"
+        assert len({entity["unique_id"] for entity in entities}) == len(entities)
+        of_state = [entity for entity in entities if entity.get("state_topic") == f"{BASE}/state"]
+        assert len(of_state) >= 8
+        for entity in of_state:
+            key = entity["value_template"].split("value_json.")[1].split()[0]
+            assert key in state
+        others = {entity.get("state_topic") or entity.get("topic") for entity in entities} - {None}
+        assert others == {f"{BASE}/state", f"{BASE}/objects", f"{BASE}/snapshot"}
+
+    with_station(port, work)
+
+
+@pytest.mark.parametrize("service", [["--mqtt-commands", "true"]], indirect=True)
+def test_a_command_is_executed_where_that_is_set(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        await station.wait(f"{BASE}/available", b"online")
+        for text in ("stop", "fly away"):
+            await station.send(text)
+            reply = json.loads(await station.wait(f"{BASE}/result"))
+            assert (reply["command"], reply["success"]) == (text, text == "stop"), reply
+
+    with_station(port, work)
+
+
+def test_nothing_of_images_is_encoded_without_a_new_object(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        await station.wait(f"{BASE}/available", b"online")
+        with service.client() as session:
+            status = session.declare_subscriber("companion/vehicle1/status")
+            for _ in range(2):
+                published = json.loads((await asyncio.to_thread(status.recv)).payload.to_string())["bus"][
+                    "published"
+                ]
+                assert not published.get(IMAGE.name)
+
+    with_station(port, work)
