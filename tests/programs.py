@@ -84,7 +84,7 @@ NEEDS = {
     "MAVProxy": Need(MAVPROXY is not None, "MAVProxy as a client"),
     "pyzeros": Need(PYZEROS.is_file(), "rmw_zenoh with another implementation"),
     "mosquitto": Need(MOSQUITTO is not None, "MQTT with a broker", debian="mosquitto"),
-    "openssl": program("openssl", "zenoh with TLS", "openssl"),
+    "openssl": program("openssl", "zenoh and MQTT with TLS", "openssl"),
     "systemd-analyze": program("systemd-analyze", "the exposure of the units", "systemd"),
     "C compiler": program(COMPILER, "the compiled simulator", "gcc"),
     "ROS 2 Jazzy": ros("Jazzy"),

@@ -17,7 +17,10 @@ def broker(port: int, folder: Path, more: str = "") -> Iterator[subprocess.Popen
     """Run mosquitto meanwhile. `more`: lines of its configuration, instead of access for everybody."""
     assert MOSQUITTO is not None
     file = folder / f"mosquitto{port}.conf"
-    file.write_text(f"listener {port} 127.0.0.1\npersistence false\n{more or 'allow_anonymous true'}\n")
+    # Started by root it would become another user, who cannot read the test's files.
+    file.write_text(
+        f"user root\nlistener {port} 127.0.0.1\npersistence false\n{more or 'allow_anonymous true'}\n"
+    )
     process = subprocess.Popen(
         [MOSQUITTO, "-c", str(file)], stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT
     )

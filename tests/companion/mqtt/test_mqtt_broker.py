@@ -169,17 +169,48 @@ def test_a_retained_or_large_message_is_no_command(tmp_path: Path) -> None:
         with_link(work, port)
 
 
-def test_a_wrong_password_is_said_and_never_shown(tmp_path: Path) -> None:
-    port, secret = free_port(socket.SOCK_STREAM), tmp_path / "secret"
-    secret.write_text("a wrong password\n")
+CERTIFICATE = (
+    "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN={name} "
+    "-addext subjectAltName=IP:127.0.0.1 -keyout {name}.key -out {name}.pem"
+)
+
+
+@pytest.mark.needs("openssl")
+@pytest.mark.parametrize(
+    ("password", "authority", "line"),
+    [
+        ("propeller", "broker", "open mqtts://"),
+        ("a wrong password", "broker", "uthori"),
+        ("propeller", "stranger", "certificate verify failed"),
+    ],
+)
+def test_a_broker_with_tls_and_a_password(password: str, authority: str, line: str, tmp_path: Path) -> None:
+    port, secret, users = free_port(socket.SOCK_STREAM), tmp_path / "secret", tmp_path / "users"
+    for name in ("broker", "stranger"):
+        subprocess.run(CERTIFICATE.format(name=name).split(), check=True, capture_output=True, cwd=tmp_path)
+    subprocess.run(["mosquitto_passwd", "-c", "-b", users, "drone", "propeller"], check=True)
+    secret.write_text(f"{password}\n")
     secret.chmod(0o600)
+    more = f"allow_anonymous false\npassword_file {users}\n"
+    more += f"certfile {tmp_path}/broker.pem\nkeyfile {tmp_path}/broker.key"
 
-    async def work(_: BrokerLink, said: Said, __: list[str]) -> None:
-        assert "uthori" in await said.wait("paused: ")
+    async def run() -> list[str]:
+        said = Said()
+        section = MqttSection(
+            url=f"mqtts://127.0.0.1:{port}",
+            username="drone",
+            password_file=str(secret),
+            ca_file=str(tmp_path / f"{authority}.pem"),
+        )
+        running = asyncio.create_task(BrokerLink(broker_of(section), AVAILABLE, said.say).run())
+        await said.wait(line)
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+        return said.lines
 
-    with mosquitto.broker(port, tmp_path, "allow_anonymous false"):
-        lines = with_link(work, port, username="drone", password_file=str(secret))
-    assert not any("wrong password" in line for line in lines)
+    with mosquitto.broker(port, tmp_path, more):
+        lines = asyncio.run(run())
+    assert not any(password in line for line in lines)
 
 
 @pytest.mark.parametrize("name", ["password_file", "ca_file"])
