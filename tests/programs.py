@@ -23,8 +23,9 @@ DATA = Path(os.environ.get("COMPANION_TEST_DATA", HERE.parents[1] / "shared" / "
 AXE = HERE / "companion" / "dashboard" / "node_modules" / "axe-core" / "axe.min.js"
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NODE = shutil.which("node")
-# Debian has it where only root looks.
+# Debian has them where only root looks.
 MOSQUITTO = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
+NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
 # GPL, and its requirements would replace the headless OpenCV: it has an environment of its own.
 MAVPROXY = shutil.which("mavproxy.py", path=str(HERE.parent / ".venv-mavproxy" / "bin")) or shutil.which(
     "mavproxy.py"
@@ -85,6 +86,7 @@ NEEDS = {
     "pyzeros": Need(PYZEROS.is_file(), "rmw_zenoh with another implementation"),
     "mosquitto": Need(MOSQUITTO is not None, "MQTT with a broker", debian="mosquitto"),
     "openssl": program("openssl", "zenoh and MQTT with TLS", "openssl"),
+    "nginx": Need(NGINX is not None, "the page behind a proxy", debian="nginx-light"),
     "systemd-analyze": program("systemd-analyze", "the exposure of the units", "systemd"),
     "C compiler": program(COMPILER, "the compiled simulator", "gcc"),
     "ROS 2 Jazzy": ros("Jazzy"),

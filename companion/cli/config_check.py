@@ -114,7 +114,7 @@ class _Check:
         if section.listen:
             with self.fault():
                 token = None if section.token_file is None else read_token(section.token_file)
-                Access(section.listen.rpartition(":")[0], token)
+                Access(section.listen.rpartition(":")[0], token, hosts=section.hosts)
 
     def network(self, settings: Settings) -> None:
         """Check zenoh's configuration files and the files of TLS that they name."""

@@ -78,6 +78,7 @@ def _serve_page(settings: Settings) -> None:
             settings.vehicle.name,
             settings.language,
             settings.plugins.modules,
+            settings.dashboard.hosts,
         )
         os.nice(NICENESS)
         try:

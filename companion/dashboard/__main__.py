@@ -26,10 +26,10 @@ def main() -> int:
     values = json.loads(read_options())
     zenoh = settings_in_child(values.pop("zenoh"))
     language = LanguageSection.model_validate_json(json.dumps(values.pop("language")))
-    plugins = tuple(values.pop("plugins"))
+    plugins, hosts = tuple(values.pop("plugins")), tuple(values.pop("hosts"))
     on_parent_end(lambda: os._exit(0))  # zenoh's threads and open streams need no shutdown
     try:
-        options = DashboardOptions(zenoh=zenoh, language=language, plugins=plugins, **values)
+        options = DashboardOptions(zenoh=zenoh, language=language, plugins=plugins, hosts=hosts, **values)
         asyncio.run(serve(options, lambda url: print(url, flush=True), "--dashboard-listen"))
     except (DashboardError, BusError, PassingError) as error:
         print(error, flush=True)

@@ -2,7 +2,7 @@
 
 A browser sends requests to any address on behalf of any page. Therefore every request needs a `Host` of ours
 (DNS rebinding) and, where the browser says which page it comes from (`Origin`, `Sec-Fetch-Site`), our own; a
-POST also needs a header that other pages cannot set.
+POST also needs a header that other pages cannot set. The names of a proxy are ours if they are listed.
 """
 
 from __future__ import annotations
@@ -69,19 +69,27 @@ class Access:
     Attributes:
         host: the address that it listens on. token: None: none is needed.
         page: it serves a page to browsers; without one, a program's POST needs no `HEADER`.
+        hosts: names of a proxy before it, NAME or NAME:PORT as in a browser's address. The port of a `Host`
+            is not compared, that of an `Origin` is.
 
     Raises:
-        DashboardError: other computers can reach `host`, and there is no token.
+        DashboardError: other computers can reach it, by `host` or by a proxy, and there is no token.
     """
 
     host: str
     token: str | None = None
     page: bool = True
+    hosts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.token is None and not is_loopback(self.host):
             raise DashboardError(
                 f"dashboard.listen {self.host} is open to other computers: dashboard.token_file must be set"
+            )
+        if self.token is None and self.hosts:
+            raise DashboardError(
+                f"dashboard.hosts {', '.join(self.hosts)}: a proxy opens the page to other computers: "
+                "dashboard.token_file must be set"
             )
 
     @property
@@ -101,9 +109,11 @@ class Access:
         """
         host = headers.get("host", "")
         if not self._host_is_ours(host):
-            return ErrorResponse(403, f"Host {host!r} is not an address of this server")
+            hint = ": dashboard.hosts accepts the names of a proxy" if self.page else ""
+            return ErrorResponse(403, f"Host {host!r} is not an address of this server{hint}")
         origin = headers.get("origin")
-        if origin is not None and origin not in (f"http://{host}", f"https://{host}"):
+        own = {f"{way}://{name}" for way in ("http", "https") for name in (host, *map(str.lower, self.hosts))}
+        if origin is not None and origin not in own:
             return ErrorResponse(403, f"Origin {origin!r} is another page")
         # Following a link to the page is harmless: it cannot be framed, and the link's page cannot read it.
         followed_link = method == "GET" and path == "/" and headers.get("sec-fetch-mode") == "navigate"
@@ -128,14 +138,20 @@ class Access:
 
     def _host_is_ours(self, header: str) -> bool:
         """Whether a `Host` is an address, or a name that no one else can point at this computer."""
-        name = header.rpartition(":")[0] if header.rpartition(":")[2].isdecimal() else header
-        name = name.lower()
+        name = _without_port(header).lower()
         if name == self.host or name == "localhost":
             return bool(name)
+        if name in (_without_port(host).lower() for host in self.hosts):
+            return True
         if is_loopback(self.host):
             return is_loopback(name.strip("[]"))
         own = socket.gethostname().lower()
         return _address(name.strip("[]")) is not None or name in (own, f"{own}.local")
+
+
+def _without_port(host: str) -> str:
+    name, _, port = host.rpartition(":")
+    return name if port.isdecimal() else host
 
 
 def _address(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:

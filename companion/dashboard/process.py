@@ -35,6 +35,7 @@ async def dashboard_process(settings: Settings, say: Callable[[str], None]) -> A
         "vehicle": settings.vehicle.name,
         "language": settings.language.model_dump(mode="json"),
         "plugins": settings.plugins.modules,
+        "hosts": settings.dashboard.hosts,
     }
     async with child_process("dashboard", "companion.dashboard", json.dumps(options), say):
         yield

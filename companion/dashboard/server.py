@@ -72,6 +72,7 @@ class DashboardOptions:
         zenoh: settings of a client (`companion.bus.client.client_settings`).
         vehicle: name of the vehicle that is shown first.
         language, plugins: of the chat; modules.
+        hosts: names of a proxy (`Access`).
     """
 
     listen: str
@@ -80,6 +81,7 @@ class DashboardOptions:
     vehicle: str
     language: LanguageSection = field(default_factory=LanguageSection)
     plugins: tuple[str, ...] = ()
+    hosts: tuple[str, ...] = ()
 
 
 class _Server(uvicorn.Server):
@@ -110,7 +112,7 @@ async def serve(options: DashboardOptions, on_ready: Callable[[str], None], flag
     """
     host, port = split_listen(options.listen)
     token = None if options.token_file is None else read_token(options.token_file)
-    access = Access(host, token)
+    access = Access(host, token, hosts=options.hosts)
     with listening_socket(host, port, flag) as listener:
         fleet = Fleet(options.zenoh, options.vehicle)
         chats = Chats(fleet, options.language, options.plugins)

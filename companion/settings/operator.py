@@ -17,6 +17,7 @@ from companion.settings.texts import (
     MQTT_URL,
     ROS_NAME,
     ROS_NAMESPACE,
+    PageHost,
     ZenohEndpoint,
 )
 
@@ -27,7 +28,9 @@ class DashboardSection(Section):
     listen: Annotated[str, HOST_AND_PORT_OR_EMPTY] = "127.0.0.1:8088"
     """HOST:PORT of the page; empty: none"""
     token_file: str | None = None
-    """file with the token, readable by its owner only; required if other computers can reach `listen`"""
+    """file with the token, readable by its owner only; required if other computers can reach the page"""
+    hosts: tuple[PageHost, ...] = ()
+    """names under which a proxy such as nginx serves the page, as in a browser's address"""
 
 
 class RecordingSection(VideoSection):

@@ -23,6 +23,14 @@ MQTT_URL = StringConstraints(
 MQTT_PREFIX = StringConstraints(pattern=r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$", max_length=200)
 MQTT_PREFIX_OR_EMPTY = StringConstraints(pattern=r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$", max_length=200)
 HOST_AND_PORT_OR_EMPTY = StringConstraints(pattern=r"^([^\s:]+:[0-9]{1,5})?$", max_length=300)
+# As a browser sends it in `Host`: of https://NAME:PORT/path the middle, without the default port.
+PageHost = Annotated[
+    str,
+    StringConstraints(
+        pattern=r"^([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?$",
+        max_length=300,
+    ),
+]
 # The same without a dot, since `cameras.NAME.source` is a key.
 CAMERA_NAME = StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_-]*$", max_length=64)
 CameraName = Annotated[str, CAMERA_NAME]
@@ -53,6 +61,9 @@ PATTERN_MEANINGS = {
     r"^[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*$": "words of letters, digits, `_`, `-` and `.`, separated by `/`",
     r"^([A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*)?$": (
         "words of letters, digits, `_`, `-` and `.`, separated by `/`; or empty"
+    ),
+    r"^([A-Za-z0-9]([A-Za-z0-9._-]*[A-Za-z0-9])?|\[[0-9A-Fa-f:.]+\])(:[0-9]{1,5})?$": (
+        "a host without scheme and path, such as drone.example.org or drone.example.org:8443"
     ),
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$": (

@@ -65,6 +65,7 @@ def test_missing_file_is_a_fault(key: str, tmp_path: Path) -> None:
         ("vehicle.url", ["--vehicle-url", "serial:///dev/ttyAMA0"]),
         ("vehicle.url", ["--vehicle-url", "udpin://0.0.0.0:99999"]),
         ("dashboard.listen", ["--dashboard-listen", "0.0.0.0:8088"]),
+        ("dashboard.hosts", ["--dashboard-hosts", "drone.example.org"]),
         ("source.uri", ["--source", "absent.mp4"]),
         ("source.uri", ["--source", "nonsense://0"]),
         ("source.uri", ["--source", "csi://front"]),

@@ -34,12 +34,15 @@ async def serving(
     port: int | None = None,
     token_file: Path | None = None,
     language: LanguageSection | None = None,
+    hosts: tuple[str, ...] = (),
 ) -> AsyncIterator[int]:
     """Serve the page of the service at a zenoh endpoint; yields the port."""
     port = free_port(socket.SOCK_STREAM) if port is None else port
     zenoh = ZenohSection(mode="client", connect=(endpoint,), listen=())
     token = None if token_file is None else str(token_file)
-    options = DashboardOptions(f"{listen}:{port}", token, zenoh, NAME, language or LanguageSection())
+    options = DashboardOptions(
+        f"{listen}:{port}", token, zenoh, NAME, language or LanguageSection(), hosts=hosts
+    )
     ready = asyncio.Event()
     running = asyncio.create_task(serve(options, lambda _url: ready.set(), "--listen"))
     starting = asyncio.create_task(ready.wait())
@@ -110,14 +113,14 @@ def dashboard_command(endpoint: str, cwd: Path | None = None) -> Iterator[str]:
 class EventStream:
     """An open stream of the page's state."""
 
-    def __init__(self, port: int, query: str) -> None:
+    def __init__(self, port: int, query: str, headers: dict[str, str]) -> None:
         self.connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
-        self.connection.request("GET", f"/events{query}")
+        self.connection.request("GET", f"/events{query}", headers=headers)
         self.response = self.connection.getresponse()
 
     @classmethod
-    async def open(cls, port: int, query: str = "") -> EventStream:
-        return await asyncio.to_thread(cls, port, query)
+    async def open(cls, port: int, query: str = "", headers: dict[str, str] | None = None) -> EventStream:
+        return await asyncio.to_thread(cls, port, query, headers or {})
 
     async def next(self) -> dict[str, Any] | None:
         """Return the next event's data; None at the end of the stream."""

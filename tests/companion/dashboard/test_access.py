@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import socket
 from pathlib import Path
 
 import pytest
 
 from companion.dashboard.access import COOKIE, HEADER, Access, DashboardError, is_loopback, read_token
+from companion.settings.reading import ConfigurationError, load_settings
 
 TOKEN = "0123456789abcdef0123456789abcdef"
 LOCAL = Access("127.0.0.1")
@@ -47,6 +49,46 @@ def test_other_origin_is_refused(origin: str) -> None:
     headers = {"host": HOST, "origin": origin, HEADER: "1"}
     assert status(LOCAL, "POST", "/command", headers) == 403
     assert status(LOCAL, "GET", "/events", headers) == 403
+
+
+def test_names_of_a_proxy_are_accepted_as_host_and_origin() -> None:
+    proxied = Access("127.0.0.1", TOKEN, hosts=("Drone.example.org", "lab.example:8443"))
+    for host, origin, expected in (
+        ("drone.example.org", "https://drone.example.org", 200),
+        ("drone.example.org", "http://drone.example.org", 200),
+        ("drone.example.org:9000", "http://drone.example.org:9000", 200),
+        (HOST, "https://drone.example.org", 200),  # the proxy sends its own Host
+        (HOST, "https://lab.example:8443", 200),
+        (HOST, f"http://{HOST}", 200),
+        (HOST, "https://drone.example.org:9000", 403),
+        (HOST, "https://lab.example", 403),
+        ("drone.example.org", "https://evil.example", 403),
+        ("drone.example.org", "null", 403),
+        ("evil.example", "https://drone.example.org", 403),
+        ("drone.example.org.evil.example", None, 403),
+        ("sub.drone.example.org", None, 403),
+        ("", None, 403),
+    ):
+        headers = {"host": host, HEADER: "1"} | ({} if origin is None else {"origin": origin})
+        assert status(proxied, "POST", "/command", headers) == expected, (host, origin)
+
+
+@pytest.mark.parametrize(
+    "host", ["https://drone.example.org", "drone.example.org/page", "*.example", "", "a b"]
+)
+def test_what_is_no_host_is_refused_in_the_settings(host: str) -> None:
+    with pytest.raises(ConfigurationError, match=r"dashboard\.hosts: must be .* such as drone\.example\.org"):
+        load_settings(None, {"dashboard.hosts": json.dumps([host])})
+
+
+def test_hosts_may_have_a_port_or_be_addresses() -> None:
+    hosts = ("drone.example.org", "lab:8443", "192.168.1.5", "[fd00::1]:8443")
+    assert load_settings(None, {"dashboard.hosts": ",".join(hosts)}).dashboard.hosts == hosts
+
+
+def test_proxy_needs_a_token() -> None:
+    with pytest.raises(DashboardError, match=r"dashboard\.hosts .*\.token_file"):
+        Access("127.0.0.1", hosts=("drone.example.org",))
 
 
 def test_post_needs_the_header_that_other_pages_cannot_send() -> None:
