@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import ipaddress
 import json
-from collections import Counter
-from collections.abc import Callable
+from collections import Counter, deque
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from threading import Event, Lock
@@ -19,9 +19,14 @@ from companion.bus.topics import LARGE_TOPICS, ROOT, RUN, TOPICS, Topic
 from companion.host.passing import AddressTakenError
 from companion.recording import RecordingError
 from companion.recording.convert import Converter, large_channel
-from companion.recording.files import Channel
+from companion.recording.files import Channel, Recorded
 from companion.recording.recorder import subscribe_all
 from companion.settings import ZenohSection
+
+MAX_KEPT_CHANNELS = 64
+"""A camera has up to three, and each name on the bus may be a camera's."""
+MAX_KEPT_BYTES = 1024 * 1024
+"""Of one channel, besides `Topic.cached` messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,8 +38,34 @@ class LiveOptions:
     listen: str
 
 
+class Kept:
+    """The newest messages of one channel, oldest first, for viewers that come later.
+
+    Args:
+        messages: most of them. They have at most `MAX_KEPT_BYTES` together.
+    """
+
+    def __init__(self, messages: int) -> None:
+        self._messages: deque[Recorded] = deque()
+        self._most, self._bytes = messages, 0
+
+    def add(self, message: Recorded) -> None:
+        """Keep a message, and drop the oldest of too many."""
+        self._messages.append(message)
+        self._bytes += len(message.data)
+        while len(self._messages) > self._most or self._bytes > MAX_KEPT_BYTES:
+            self._bytes -= len(self._messages.popleft().data)
+
+    def __iter__(self) -> Iterator[Recorded]:
+        return iter(self._messages)
+
+
 class Live(ServerListener):
-    """Sends messages to viewers. Images and point clouds are subscribed to only while a viewer shows them."""
+    """Sends messages to viewers. Images and point clouds are subscribed to only while a viewer shows them.
+
+    A viewer that comes later begins with the messages that the service keeps (`Topic.cached`). One that is
+    sent in the instant between its subscription and `on_subscribe` it gets before them, and again with them.
+    """
 
     def __init__(self, options: LiveOptions, session: zenoh.Session) -> None:
         self._vehicle, self._session = options.vehicle, session
@@ -42,7 +73,10 @@ class Live(ServerListener):
         self._channels: dict[str, foxglove.Channel] = {}
         self._viewers: Counter[str] = Counter()
         self._large: dict[str, zenoh.Subscriber[None]] = {}
-        self._lock = Lock()  # zenoh's threads, and the server's
+        self._kept: dict[str, Kept] = {}
+        # zenoh's threads, and the server's. A message is kept and sent under it: a viewer that comes between
+        # the two would not get it, or get it before older ones.
+        self._lock = Lock()
         host, _, port = options.listen.rpartition(":")
         for topic in LARGE_TOPICS:
             self._channel(large_channel(topic))
@@ -76,6 +110,9 @@ class Live(ServerListener):
                 key = f"{ROOT}/{self._vehicle}{channel.topic}"
                 receive = partial(self._on_sample, large)
                 self._large[channel.topic] = self._session.declare_subscriber(key, receive)
+            for message in self._kept.get(channel.topic, ()):
+                # A viewer's sink has the number of its client: nothing else in this process is a sink.
+                self._log(message, sink_id=client.id)
 
     def on_unsubscribe(self, client: Client, channel: ChannelView) -> None:
         """Called by the server: a viewer shows a topic no more."""
@@ -93,13 +130,26 @@ class Live(ServerListener):
                 messages = list(self._converter.convert(path, payload, attachment))
                 if path == RUN.name:
                     for camera in json.loads(messages[0].data)["settings"]["cameras"]:
-                        for topic in LARGE_TOPICS:
-                            self._channel(large_channel(topic, f"cameras/{camera}"))
-                channels = [self._channel(message.channel) for message in messages]
+                        for large in LARGE_TOPICS:
+                            self._channel(large_channel(large, f"cameras/{camera}"))
+                for message in messages:
+                    if topic.cached:
+                        self._keep(message, topic.cached)
+                    self._log(message)
         except (ValueError, KeyError, TypeError):
             return  # of another version, another program's, or too large
-        for channel, message in zip(channels, messages, strict=True):
-            channel.log(message.data, log_time=message.log_time_ns)
+
+    def _keep(self, message: Recorded, most: int) -> None:
+        name = message.channel.topic
+        if name not in self._kept and len(self._kept) < MAX_KEPT_CHANNELS:
+            self._kept[name] = Kept(most)
+        if name in self._kept:
+            self._kept[name].add(message)
+
+    def _log(self, message: Recorded, sink_id: int | None = None) -> None:
+        """Send to all viewers of the channel, or to one."""
+        channel = self._channel(message.channel)
+        channel.log(message.data, log_time=message.log_time_ns, sink_id=sink_id)
 
     def _channel(self, channel: Channel) -> foxglove.Channel:
         found = self._channels.get(channel.topic)

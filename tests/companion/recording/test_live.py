@@ -1,7 +1,8 @@
-"""Foxglove live: a viewer gets the channels of a recording; images only while it shows them."""
+"""Foxglove live: a viewer gets the channels of a recording, images while it shows them, and kept messages."""
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
 import os
@@ -13,11 +14,17 @@ from typing import Any
 
 import pytest
 
+from companion.bus.client import settings_for_child
+from companion.bus.session import Bus
+from companion.bus.topics import COMMAND_STATE, EVENTS, STATUS, TRACKS
+from companion.host.child_process import child_process
+from companion.recording.files import Channel, Recorded
+from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port, running_simulator
 from tests.companion.service_process import TWICE, heartbeats, running_service
 
 pytestmark = pytest.mark.realtime
-pytest.importorskip("foxglove", reason="foxglove-sdk is an optional extra")
+live = pytest.importorskip("companion.recording.live", reason="foxglove-sdk is an optional extra")
 
 TEXT, BINARY = 1, 2
 MESSAGE_DATA = 1
@@ -102,6 +109,93 @@ def test_viewer_gets_messages_and_images(filming: list[str], tmp_path: Path) -> 
             assert body["timestamp"]["sec"] == log_time_ns // 10**9
         finally:
             viewer.close()
+
+
+STAMPS = [1_000_000 * number for number in range(200)]
+
+
+def event(number: int) -> dict[str, Any]:
+    return {"stamp_ns": STAMPS[number], "level": "info", "text": f"event {number}"}
+
+
+def show(port: int, *topics: str) -> Viewer:
+    """A new viewer of these topics, whose subscriptions are numbered from 1."""
+    viewer = Viewer(port)
+    wanted = [
+        {"id": number, "channelId": viewer.wait_for_channel(topic)["id"]}
+        for number, topic in enumerate(topics, 1)
+    ]
+    viewer.send({"op": "subscribe", "subscriptions": wanted})
+    return viewer
+
+
+def kept(port: int, topic: str, count: int) -> list[tuple[int, dict[str, Any]]]:
+    """The first messages that a new viewer of a topic gets."""
+    viewer = show(port, topic)
+    try:
+        return [viewer.wait_for_message(1) for _ in range(count)]
+    finally:
+        viewer.close()
+
+
+async def no_command(_text: str) -> dict[str, Any]:
+    raise AssertionError
+
+
+async def test_late_viewer_begins_with_the_kept_messages() -> None:
+    endpoint, port = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", free_port(socket.SOCK_STREAM)
+    settings = ZenohSection(listen=(endpoint,))
+    bus = Bus(settings, "alpha", on_event=lambda *_: None, on_command=no_command, views=["down"])
+    options = {"listen": f"127.0.0.1:{port}", "vehicle": "alpha", "zenoh": settings_for_child(settings)}
+    lines: asyncio.Queue[str] = asyncio.Queue()
+    await bus.start()
+    try:
+        for number in range(5):  # before the process is there: the service keeps them
+            bus.publish(EVENTS, event(number))
+        async with (
+            child_process("foxglove", "companion.recording", json.dumps(options), lines.put_nowait),
+            asyncio.timeout(60),
+        ):
+            assert "open ws://" in await lines.get()
+            messages = await asyncio.to_thread(kept, port, "/log", 5)
+            assert [body["message"] for _, body in messages] == [f"event {number}" for number in range(5)]
+            early = await asyncio.to_thread(show, port, "events")
+            assert [early.wait_for_message(1)[1]["stamp_ns"] for _ in range(5)] == STAMPS[:5]
+
+            for number in range(5, 140):
+                bus.publish(EVENTS, event(number))
+            for number in range(3):
+                bus.publish(STATUS, {"now_ns": number})
+                bus.publish(TRACKS, {"stamp_ns": number}, view="down")
+                bus.publish(COMMAND_STATE, {"stamp_ns": number})
+            while (await asyncio.to_thread(early.wait_for_message, 1))[1]["stamp_ns"] != STAMPS[139]:
+                pass
+            messages = await asyncio.to_thread(kept, port, "events", EVENTS.cached)
+            assert [body["stamp_ns"] for _, body in messages] == STAMPS[40:140]
+            log_times = [log_time_ns for log_time_ns, _ in messages]
+            assert [time - log_times[0] for time in log_times] == [
+                stamp - STAMPS[40] for stamp in STAMPS[40:140]
+            ]
+            for topic in ("cameras/down/tracks", "command_state"):
+                messages = await asyncio.to_thread(kept, port, topic, 3)
+                assert [body["stamp_ns"] for _, body in messages] == [0, 1, 2]
+            ((_, status),) = await asyncio.to_thread(kept, port, "status", STATUS.cached)
+            assert status["now_ns"] == 2
+
+            bus.publish(EVENTS, event(140))  # the others' kept messages are not sent to this one again
+            assert (await asyncio.to_thread(early.wait_for_message, 1))[1]["stamp_ns"] == STAMPS[140]
+            early.close()
+    finally:
+        await bus.close()
+
+
+def test_bytes_of_kept_messages_are_bounded() -> None:
+    kept = live.Kept(100)
+    for number in range(20):
+        kept.add(
+            Recorded(Channel("tracks", "companion.tracks", b"{}"), number, bytes(live.MAX_KEPT_BYTES // 10))
+        )
+    assert [message.log_time_ns for message in kept] == list(range(10, 20))
 
 
 def test_service_reports_busy_port_and_bad_folder_and_runs(tmp_path: Path) -> None:
