@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from zenoh import ext
 
 from companion.bus.config import read_config_file
+from companion.bus.connection_fault import connection_fault
 from companion.bus.session import zenoh_config
 from companion.bus.topics import (
     IMAGE,
@@ -102,7 +103,7 @@ def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[z
     """Open a session that is connected to at least one node.
 
     Raises:
-        NoAnswerError: no node within `timeout_s`.
+        NoAnswerError: no node within `timeout_s`, or one that refuses (`connection_fault`).
     """
     session = _open(settings, time.monotonic() + timeout_s)
     try:
@@ -114,12 +115,14 @@ def open_client(settings: ZenohSection, *, timeout_s: float = 2.0) -> Iterator[z
 
 def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
     while True:
+        config = zenoh_config(settings)
         try:
-            return zenoh.open(zenoh_config(settings))
+            return zenoh.open(config)
         except zenoh.ZError as error:
             if time.monotonic() > deadline:
                 where = ", ".join(settings.connect) or "the local network"
-                raise NoAnswerError(f"{no_node_text(where)} (--connect selects another endpoint)") from error
+                missing = f"{no_node_text(where)} (--connect selects another endpoint)"
+                raise NoAnswerError(connection_fault(config) or missing) from error
         time.sleep(0.1)
 
 

@@ -16,6 +16,7 @@ import zenoh
 
 from companion.bus.bodies.vehicle import VelocityBody
 from companion.bus.client import NoAnswerError, no_node_text, send_command
+from companion.bus.connection_fault import connection_fault
 from companion.bus.session import encode, zenoh_config
 from companion.bus.topics import VELOCITY, alive_key
 from companion.dashboard.bridge import Bridge, Link
@@ -249,10 +250,12 @@ class Fleet:
         return [_vehicle_of(reply.ok) for reply in replies if reply.ok is not None]
 
     async def _connect(self) -> None:
+        config = zenoh_config(self._settings)
         try:
-            self._link.session = await asyncio.to_thread(zenoh.open, zenoh_config(self._settings))
+            self._link.session = await asyncio.to_thread(zenoh.open, config)
         except zenoh.ZError:
-            self._link.problem = no_node_text(", ".join(self._settings.connect))
+            fault = await asyncio.to_thread(connection_fault, config)
+            self._link.problem = fault or no_node_text(", ".join(self._settings.connect))
             return
         self._link.problem = ""
         self._subscribe()

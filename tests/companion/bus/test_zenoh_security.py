@@ -29,12 +29,17 @@ pytestmark = [
 PAGE = (Path(__file__).parents[3] / "docs" / "how-to" / "zenoh-security.md").read_text()
 
 
+def make_certificates(folder: Path) -> None:
+    """Run the commands of the page in a folder."""
+    commands = re.findall(r"^```sh\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)[0]
+    subprocess.run(["bash", "-ec", commands], check=True, capture_output=True, timeout=60, cwd=folder)
+
+
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The files of the page, in the current folder."""
     monkeypatch.chdir(tmp_path)
-    certificates = re.findall(r"^```sh\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)[0]
-    subprocess.run(["bash", "-ec", certificates], check=True, capture_output=True, timeout=60)
+    make_certificates(tmp_path)
     service, operator = re.findall(r"^```json5\n(.*?)^```", PAGE, re.MULTILINE | re.DOTALL)
     Path("vehicle1.json5").write_text(service)
     Path("operator.json5").write_text(operator)
