@@ -126,6 +126,27 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
         time.sleep(0.1)
 
 
+def alive_vehicles(session: zenoh.Session) -> list[str]:
+    """Return the names of the vehicles whose service runs, as the node of this session knows them."""
+    replies = session.liveliness().get(alive_key("*"), timeout=_DISCOVERY_S)
+    return sorted(str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None)
+
+
+def only_vehicle(session: zenoh.Session) -> str | None:
+    """Return the name of the only vehicle whose service runs; None: there is none.
+
+    Raises:
+        ValueError: there are several. The message lists them.
+    """
+    names = alive_vehicles(session)
+    if len(names) > 1:
+        raise ValueError(
+            f"{len(names)} vehicles are alive: {', '.join(names)}; choose one with --vehicle-name NAME, in "
+            "Python with vehicle=NAME"
+        )
+    return names[0] if names else None
+
+
 class LastStatus:
     """What a service has said last about its vehicle, for the time when it says nothing any more."""
 

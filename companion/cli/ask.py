@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, plain_errors
+from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, named_vehicle, plain_errors, say_vehicle
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -74,7 +74,9 @@ async def _converse(
 
     where = client_settings(settings.zenoh).connect[0]
     terminal = Terminal()
-    async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
+    name, file = named_vehicle(settings), settings.zenoh.config_file
+    async with connect_to(where, name, config_file=file) as drone:
+        say_vehicle(settings, drone.name)
 
         async def stop() -> bool:
             return await send_stop(LiveVehicle(drone, (), None), terminal.show)

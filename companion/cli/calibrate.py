@@ -19,6 +19,7 @@ from companion.cli.flags import (
     check_folder,
     plain_errors,
     settings_command,
+    vehicle_of,
     with_default,
 )
 from companion.host.journal import log_to_standard_error
@@ -287,7 +288,7 @@ def mount(
             tilt = LiveTilt()
             if live:
                 session = opened.enter_context(open_client(client_settings(settings.zenoh)))
-                subscriber = listen(session, VEHICLE.key(settings.vehicle.name), tilt.on_message)
+                subscriber = listen(session, VEHICLE.key(vehicle_of(session, settings)), tilt.on_message)
                 opened.callback(subscriber.undeclare)
             found, tilts = markers_of(
                 images, kind, marker, model, frames, _note, tilt if live else lambda: held

@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, YOLO, Limit, check_belonging, plain_errors, refuse, say_silent
+from companion.cli.flags import (
+    EXIT_FAILED,
+    YOLO,
+    Limit,
+    check_belonging,
+    plain_errors,
+    refuse,
+    say_silent,
+    vehicle_of,
+)
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -59,9 +68,8 @@ def send(
         if text is None or check:
             return
         with open_client(client_settings(settings.zenoh)) as session:
-            reply = send_command(
-                session, settings.vehicle.name, text, timeout_s=limit_s, on_silent=say_silent
-            )
+            vehicle = vehicle_of(session, settings)
+            reply = send_command(session, vehicle, text, timeout_s=limit_s, on_silent=say_silent)
     typer.echo(reply_text(reply))
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)

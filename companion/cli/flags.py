@@ -27,6 +27,8 @@ from vision.gc_pause import gc_paused
 from vision.redaction import redacted
 
 if TYPE_CHECKING:
+    import zenoh
+
     from companion.settings import Settings
     from companion.settings.reading import Flag
 
@@ -233,6 +235,32 @@ def check_belonging(context: typer.Context, what: str, names: Iterable[str], *, 
 def say_silent(text: str) -> None:
     """Print what is known of a service that is silent in the middle of a command; the command waits on."""
     typer.echo(f"companion: {text}", err=True)
+
+
+def named_vehicle(settings: Settings) -> str | None:
+    """Return `vehicle.name` if a file, a variable or a flag has it; None: the only vehicle alive is meant."""
+    return settings.vehicle.name if "name" in settings.vehicle.model_fields_set else None
+
+
+def vehicle_of(session: zenoh.Session, settings: Settings) -> str:
+    """Return the vehicle that a client command is for, and print its name if it was not given.
+
+    With no vehicle alive it is the one of the default name, which the command will miss.
+
+    Raises:
+        ValueError: no name was given, and several vehicles are alive.
+    """
+    from companion.bus.client import only_vehicle
+
+    name = named_vehicle(settings) or only_vehicle(session) or settings.vehicle.name
+    say_vehicle(settings, name)
+    return name
+
+
+def say_vehicle(settings: Settings, name: str) -> None:
+    """Print the name of a vehicle that was found, unless it is the expected one."""
+    if name != settings.vehicle.name:
+        typer.echo(f"companion: vehicle {name!r}, the only one alive", err=True)
 
 
 def warn_rendered_only(models: Iterable[tuple[str, str | None]]) -> None:

@@ -34,6 +34,7 @@ from companion.cli.flags import (
     check_seed_options,
     plain_errors,
     settings_command,
+    vehicle_of,
 )
 from companion.host.journal import log_to_standard_error
 
@@ -70,7 +71,7 @@ def collect(
     service until Ctrl-C. The labels are the model's own boxes; correct them, then train with `companion
     learn train --data FOLDER`.
     """
-    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.client import NoAnswerError, client_settings, open_client
     from companion.bus.config import BusError
     from companion.learning import collect as collecting
     from companion.logs.frames import recorded_frames
@@ -85,8 +86,10 @@ def collect(
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: ending.set())
             zenoh = client_settings(settings.zenoh)
-            source = f"{settings.vehicle.name}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
-            frames = collecting.live_frames(zenoh, settings.vehicle.name, camera, ending)
+            with open_client(zenoh) as session:
+                vehicle = vehicle_of(session, settings)
+            source = f"{vehicle}_{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}"
+            frames = collecting.live_frames(zenoh, vehicle, camera, ending)
         for path, reasons in collecting.collect(frames, folder, source, interval_s=interval, most=most):
             kept += 1
             typer.echo(f"{path}: {', '.join(reasons)}")

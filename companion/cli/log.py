@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from companion.cli.flags import CLIENT_SETTINGS, AsJson, Command, plain_errors, refuse, settings_command
+from companion.cli.flags import (
+    CLIENT_SETTINGS,
+    AsJson,
+    Command,
+    plain_errors,
+    refuse,
+    settings_command,
+    vehicle_of,
+)
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -111,7 +119,7 @@ def record(
     directory: Annotated[Path, typer.Argument(metavar="DIR", help="Folder for the recordings.")],
 ) -> None:
     """Record a running service. Writes MCAP files until Ctrl-C or SIGTERM."""
-    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.client import NoAnswerError, client_settings, open_client
     from companion.bus.config import BusError
     from companion.recording import RecordingError
     from companion.recording.recorder import RecorderOptions
@@ -121,10 +129,13 @@ def record(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ending.set())
     recording = settings.recording
-    with plain_errors(RecordingError, NoAnswerError, BusError):
+    with plain_errors(RecordingError, NoAnswerError, BusError, ValueError):
+        zenoh = client_settings(settings.zenoh)
+        with open_client(zenoh, timeout_s=10.0) as session:
+            vehicle = vehicle_of(session, settings)
         options = RecorderOptions(
-            zenoh=client_settings(settings.zenoh),
-            vehicle=settings.vehicle.name,
+            zenoh=zenoh,
+            vehicle=vehicle,
             directory=str(directory),
             images=recording.images,
             depth="depth" in recording.content,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import CLIENT_SETTINGS, plain_errors
+from companion.cli.flags import CLIENT_SETTINGS, named_vehicle, plain_errors, say_vehicle
 
 if TYPE_CHECKING:
     from companion.dashboard.access import Access
@@ -84,7 +84,9 @@ async def _serve(settings: Settings, allowed: list[str], listen: str | None, acc
     from companion.language.mcp_server import PATH, FlightTools, http_app, serve_stdio, server_of
 
     where = client_settings(settings.zenoh).connect[0]
-    async with connect_to(where, settings.vehicle.name, config_file=settings.zenoh.config_file) as drone:
+    name, file = named_vehicle(settings), settings.zenoh.config_file
+    async with connect_to(where, name, config_file=file) as drone:
+        say_vehicle(settings, drone.name)
         camera = (await drone.query("config"))["guidance"]["camera"]
         vehicle = LiveVehicle(drone, (), camera)
         await vehicle.forget_loss()  # an operator starts this program

@@ -10,12 +10,13 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from companion.cli.download import Pull
-from companion.cli.flags import plain_errors, refuse
+from companion.cli.flags import plain_errors, refuse, vehicle_of
 from companion.cli.run import after_pull, run_service
 
 if TYPE_CHECKING:
@@ -65,17 +66,21 @@ def view(
 
 def _serve_page(settings: Settings) -> None:
     """Serve the page of a running service until Ctrl-C."""
-    from companion.bus.client import NoAnswerError, client_settings
+    from companion.bus.client import NoAnswerError, client_settings, open_client
     from companion.bus.config import BusError
     from companion.dashboard.access import DashboardError
     from companion.dashboard.server import NICENESS, DashboardOptions, serve
 
     with plain_errors(NoAnswerError, DashboardError, BusError):
+        zenoh, vehicle = client_settings(settings.zenoh), settings.vehicle.name
+        # The page lists all vehicles and waits for the service: it needs neither.
+        with suppress(NoAnswerError, ValueError), open_client(zenoh, timeout_s=0.0) as session:
+            vehicle = vehicle_of(session, settings)
         options = DashboardOptions(
             settings.dashboard.listen,
             settings.dashboard.token_file,
-            client_settings(settings.zenoh),
-            settings.vehicle.name,
+            zenoh,
+            vehicle,
             settings.language,
             settings.plugins.modules,
             settings.dashboard.hosts,

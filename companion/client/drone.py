@@ -19,7 +19,14 @@ from companion.bus import topics
 from companion.bus.bodies.frames import DepthBody, DetectionsBody, MarkersBody, TracksBody
 from companion.bus.bodies.service import CommandStateBody, EventBody, StatusBody
 from companion.bus.bodies.vehicle import ObstaclesBody, VehicleBody, VelocityBody
-from companion.bus.client import NoAnswerError, client_settings, open_client, send_command
+from companion.bus.client import (
+    NoAnswerError,
+    alive_vehicles,
+    client_settings,
+    only_vehicle,
+    open_client,
+    send_command,
+)
 from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.endings import Endings
 from companion.client.stream import Stream
@@ -131,7 +138,7 @@ class Drone(Commands):
 
     async def vehicles(self) -> list[str]:
         """The names of all vehicles whose service runs."""
-        return await asyncio.to_thread(_alive, self._session)
+        return await asyncio.to_thread(alive_vehicles, self._session)
 
     async def command(self, text: str) -> Reply:
         """Send any command, a plug-in's too; for a mission, its file's lines may follow the first line.
@@ -340,15 +347,8 @@ async def connect(
 
 def _only_vehicle(session: zenoh.Session, endpoint: str) -> str:
     until_s = time.monotonic() + _DISCOVERY_S
-    while not (names := _alive(session)):
+    while (name := only_vehicle(session)) is None:
         if time.monotonic() > until_s:
             raise NoAnswerError(f"no service at {endpoint}: is `companion run` running?")
         time.sleep(0.05)
-    if len(names) > 1:
-        raise ValueError(f"several vehicles at {endpoint}: give vehicle=, one of {', '.join(names)}")
-    return names[0]
-
-
-def _alive(session: zenoh.Session) -> list[str]:
-    replies = session.liveliness().get(topics.alive_key("*"), timeout=_DISCOVERY_S)
-    return sorted(str(reply.ok.key_expr).split("/")[1] for reply in replies if reply.ok is not None)
+    return name

@@ -282,7 +282,7 @@ def _print_next_commands(services: list[Service], cameras: int, scene: Scene, sa
     say("ready for commands; in another terminal:")
     for number, service in enumerate(services, 1):
         name = service.settings.vehicle.name
-        to = connect if name == "vehicle1" else f"{connect} --vehicle-name {name}"
+        to = connect if len(services) == 1 else f"{connect} --vehicle-name {name}"
         say(f'  companion send{to} "takeoff 5"{"" if len(services) == 1 else f"   # {name}"}')
         if classes and number <= cameras:
             target = "car" if "car" in classes else classes[0]
