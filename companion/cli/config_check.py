@@ -51,6 +51,7 @@ def check_settings(settings: Settings) -> list[str]:
     check.extras(settings)
     check.vehicle(settings)
     check.page(settings)
+    check.broker(settings)
     check.network(settings)
     if settings.language.key_file is not None:
         with check.fault():
@@ -91,6 +92,8 @@ class _Check:
             ("metrics.listen", "prometheus_client", settings.metrics.listen is not None, self.faults),
             ("recording.directory", "mcap", bool(settings.recording.directory), self.missing),
             ("foxglove.listen", "foxglove", settings.foxglove.listen is not None, self.missing),
+            ("mqtt.url", "aiomqtt", settings.mqtt.url is not None, self.missing),
+            ("mqtt.webhooks", "httpx", bool(settings.mqtt.webhooks), self.missing),
         ):
             if needed and find_spec(module) is None:
                 found.append(f"{key}: {module} is not installed: {install_command(module)}")
@@ -115,6 +118,14 @@ class _Check:
             with self.fault():
                 token = None if section.token_file is None else read_token(section.token_file)
                 Access(section.listen.rpartition(":")[0], token, hosts=section.hosts)
+
+    def broker(self, settings: Settings) -> None:
+        """Check the files that the broker of MQTT needs."""
+        if settings.mqtt.url is not None and find_spec("aiomqtt") is not None:
+            from companion.mqtt.broker import broker_of
+
+            with self.fault():
+                broker_of(settings.mqtt)
 
     def network(self, settings: Settings) -> None:
         """Check zenoh's configuration files and the files of TLS that they name."""

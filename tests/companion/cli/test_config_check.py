@@ -18,6 +18,8 @@ from vision.weights import DEFAULT_WEIGHTS
 
 # What a file setting needs besides, to be read at all.
 NEEDED = {
+    "mqtt.password_file": ["--mqtt-url", "mqtt://broker"],
+    "mqtt.ca_file": ["--mqtt-url", "mqtts://broker"],
     "source.depth_calibration_file": ["--source-depth", "depth"],
     "markers.boards_file": ["--markers-dictionary", "APRILTAG_36h11"],
     "markers.map_file": ["--markers-dictionary", "APRILTAG_36h11"],

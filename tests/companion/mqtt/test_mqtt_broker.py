@@ -181,12 +181,12 @@ CERTIFICATE = (
     [
         ("propeller", "broker", "open mqtts://"),
         ("a wrong password", "broker", "uthori"),
-        ("propeller", "stranger", "certificate verify failed"),
+        ("propeller", "other", "certificate verify failed"),
     ],
 )
 def test_a_broker_with_tls_and_a_password(password: str, authority: str, line: str, tmp_path: Path) -> None:
     port, secret, users = free_port(socket.SOCK_STREAM), tmp_path / "secret", tmp_path / "users"
-    for name in ("broker", "stranger"):
+    for name in ("broker", "other"):
         subprocess.run(CERTIFICATE.format(name=name).split(), check=True, capture_output=True, cwd=tmp_path)
     subprocess.run(["mosquitto_passwd", "-c", "-b", users, "drone", "propeller"], check=True)
     secret.write_text(f"{password}\n")

@@ -19,7 +19,7 @@ Answer = Callable[[int], int | None]
 
 
 class Server:
-    """A server of HTTP that answers as it is told. `requests`: Idempotency-Key and body."""
+    """A server of HTTP with given answers. `requests`: Idempotency-Key and body."""
 
     def __init__(self, answer: Answer) -> None:
         self._answer, self.requests = answer, list[tuple[str, bytes]]()
@@ -78,7 +78,7 @@ def test_events_are_posted_in_order_and_again_until_they_are_taken() -> None:
 
 
 @pytest.mark.parametrize(("status", "tries"), [(404, 1), (302, 1), (500, 4)])
-def test_a_refusal_is_final_and_a_fault_is_tried_four_times(status: int, tries: int) -> None:
+def test_another_status_is_final_and_a_fault_is_tried_four_times(status: int, tries: int) -> None:
     async def work(webhook: Webhook, server: Server) -> None:
         webhook.put("a", b"1")
         webhook.put("b", b"2")
