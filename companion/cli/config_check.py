@@ -99,7 +99,7 @@ class _Check:
                 found.append(f"{key}: {module} is not installed: {install_command(module)}")
 
     def vehicle(self, settings: Settings) -> None:
-        """Check the link's address, the serial device and the signing key."""
+        """Check the links' addresses, the serial device and the keys."""
         with self.fault("vehicle.url"):
             url = parse_link_url(settings.vehicle.url)
             device = url.address[0]
@@ -107,6 +107,13 @@ class _Check:
                 there = Path(device).exists()
                 advice = "no permission; add the user to its group (often dialout)"
                 self.missing.append(f"vehicle.url: {device}: {advice if there else 'no such device'}")
+        station = settings.ground_station
+        if station.url is not None:
+            with self.fault("ground_station.url"):
+                parse_link_url(station.url)
+        if station.video_token_file is not None:
+            with self.fault():
+                read_token(station.video_token_file, "ground_station.video_token_file")
         if settings.vehicle.signing_key_file is not None:
             with self.fault("vehicle.signing_key_file"):
                 read_key(settings.vehicle.signing_key_file)

@@ -17,6 +17,7 @@ from companion.settings.texts import (
     MQTT_URL,
     ROS_NAME,
     ROS_NAMESPACE,
+    STATION_URL,
     PageHost,
     ZenohEndpoint,
 )
@@ -102,6 +103,23 @@ class MqttSection(Section):
     """execute what is published on PREFIX/NAME/command: whoever can publish there can fly"""
     webhooks: tuple[Annotated[str, HTTP_URL], ...] = ()
     """addresses to which events of objects are posted as JSON"""
+
+
+class GroundStationSection(Section):
+    """Ground stations: the cameras over MAVLink, video, warnings."""
+
+    url: Annotated[str | None, STATION_URL] = None
+    """MAVLink endpoint of the station or router, udpout://10.0.0.2:14550; unset: no cameras are announced"""
+    video_listen: Annotated[str | None, HOST_AND_PORT] = None
+    """HOST:PORT of the video (RTSP), such as 0.0.0.0:8554; unset: no video"""
+    video_host: str | None = None
+    """this computer's name in the addresses of videos; unset: its address towards the station"""
+    video_token_file: str | None = None
+    """file with the token, readable by its owner only; required if other computers can reach video_listen"""
+    track_follows: bool = False
+    """true: a click of a station selects an object and follows it; false: it only selects"""
+    target_relative: bool = False
+    """send the selected object's position to the autopilot, as TARGET_RELATIVE"""
 
 
 class MetricsSection(Section):

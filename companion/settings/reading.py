@@ -40,7 +40,7 @@ from vision.text_file import read_text
 __all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
 
 DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
-# COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. A section's name has no underscore.
+# COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. No section's name begins with another's and `_`.
 ENVIRONMENT_PREFIX = "COMPANION_"
 
 
@@ -180,10 +180,12 @@ class _Reading:
         for variable in sorted(environment):
             if not variable.startswith(ENVIRONMENT_PREFIX):
                 continue
-            section, _, name = variable.removeprefix(ENVIRONMENT_PREFIX).lower().partition("_")
+            words = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
             # Other variables may have the prefix too; only those with a section name are settings.
-            if section in self._fields:
-                self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
+            for section in self._fields:
+                if words.startswith(f"{section}_"):
+                    name = words.removeprefix(f"{section}_")
+                    self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
 
     def take_text(self, key: str, text: str, origin: str) -> None:
         table, _, name = key.rpartition(".")

@@ -12,6 +12,7 @@ from companion.settings.language import LanguageSection
 from companion.settings.operator import (
     DashboardSection,
     FoxgloveSection,
+    GroundStationSection,
     LogSection,
     MetricsSection,
     MqttSection,
@@ -32,6 +33,9 @@ from companion.settings.perception import (
 from companion.settings.section import Section
 from companion.settings.texts import CameraName
 from companion.settings.vehicle import VehicleSection
+
+# MAV_COMP_ID_CAMERA to MAV_COMP_ID_CAMERA6.
+MOST_STATION_CAMERAS = 6
 
 
 class CameraSections(Section):
@@ -75,6 +79,7 @@ class Settings(Section):
     foxglove: FoxgloveSection = FoxgloveSection()
     ros2: Ros2Section = Ros2Section()
     mqtt: MqttSection = MqttSection()
+    ground_station: GroundStationSection = GroundStationSection()
     metrics: MetricsSection = MetricsSection()
     log: LogSection = LogSection()
     plugins: PluginsSection = PluginsSection()
@@ -128,6 +133,23 @@ class Settings(Section):
             raise ValueError(
                 "recording.max_total_mb must be at least recording.max_file_mb, got "
                 f"{self.recording.max_total_mb} and {self.recording.max_file_mb}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _ground_station_fits(self) -> Self:
+        station, vehicle = self.ground_station.url, self.vehicle.url
+        if station is None:
+            return self
+        if len(self.sources()) > MOST_STATION_CAMERAS:
+            raise ValueError(
+                f"ground_station.url: MAVLink has component ids for {MOST_STATION_CAMERAS} cameras, got "
+                f"{len(self.sources())}: remove cameras, or unset ground_station.url"
+            )
+        if station == vehicle and station.startswith(("udpin://", "serial://")):
+            raise ValueError(
+                f"ground_station.url and vehicle.url are both {station}, which can be opened once: give each "
+                "a port of its own"
             )
         return self
 

@@ -38,6 +38,7 @@ VehicleUrl = Annotated[
     str,
     StringConstraints(pattern=r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$", max_length=400),
 ]
+STATION_URL = StringConstraints(pattern=r"^(udpin|udpout|tcp|serial)://.+$", max_length=400)
 # CLASS:METRES.
 HEIGHT_TEXT = StringConstraints(pattern=r"^.+:[0-9]*\.?[0-9]+$", max_length=80)
 # ID:SIZE of a marker; with @PAD if it is on a pad, and :RIGHT:UP if it is off the pad's centre.
@@ -68,6 +69,9 @@ PATTERN_MEANINGS = {
     r"^[A-Za-z0-9][A-Za-z0-9_-]*$": "a word of letters, digits, `_` and `-`",
     r"^(none|(udpin|udpout|udp|tcp|tcpin|tcpout|serial)://.+)$": (
         "udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT, serial://DEVICE:BAUD or none"
+    ),
+    r"^(udpin|udpout|tcp|serial)://.+$": (
+        "udpout://HOST:PORT, udpin://HOST:PORT, tcp://HOST:PORT or serial://DEVICE:BAUD"
     ),
     r"^.+:[0-9]*\.?[0-9]+$": "CLASS:METRES such as person:1.7",
     r"^[0-9]+:[0-9.]+(@[0-9]+(:-?[0-9.]+:-?[0-9.]+)?)?$": (

@@ -99,6 +99,9 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "zenoh.config_file": (("describe settings --check --zenoh-config-file {}", ".json5"),),
     "zenoh.child_config_file": (("describe settings --check --zenoh-child-config-file {}", ".json5"),),
     "dashboard.token_file": (("describe settings --check --dashboard-token-file {}", ".txt"),),
+    "ground_station.video_token_file": (
+        ("describe settings --check --ground-station-video-token-file {}", ".txt"),
+    ),
     "language.key_file": (("describe settings --check --language-key-file {}", ".txt"),),
 }
 _PLAN = {"fileType": "Plan", "groundStation": "QGroundControl", "mission": {"items": []}, "version": 1}

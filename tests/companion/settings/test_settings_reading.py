@@ -51,6 +51,31 @@ def test_without_a_file_the_defaults_are_in_effect(tmp_path: Path, monkeypatch: 
     assert load_settings(environment={}) == Settings()
 
 
+def test_variable_of_a_section_with_an_underscore_is_read() -> None:
+    url = "udpout://10.0.0.2:14550"
+    assert load_settings(environment={"COMPANION_GROUND_STATION_URL": url}).ground_station.url == url
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"ground_station.url": "10.0.0.2:14550"}, ["ground_station.url", "udpout://"]),
+        (
+            {"ground_station.url": "udpin://0.0.0.0:14540", "vehicle.url": "udpin://0.0.0.0:14540"},
+            ["ground_station.url and vehicle.url", "opened once"],
+        ),
+        (
+            {"ground_station.url": "udpout://10.0.0.2:14550"}
+            | {f"cameras.c{number}.source.uri": f"file{number}.mp4" for number in range(6)},
+            ["ground_station.url", "6 cameras, got 7"],
+        ),
+    ],
+)
+def test_ground_station_that_cannot_be_is_refused(values: dict[str, str], words: list[str]) -> None:
+    (line,) = problems(overrides=values)
+    assert all(word in line for word in words), line
+
+
 def test_file_in_the_working_directory_is_the_default(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
