@@ -24,6 +24,7 @@ COMPANION_LAYERS = {
     "bus": 5,
     "client": 6,
     "recording": 6,
+    "ground_station": 7,
     "language": 7,
     "mqtt": 7,
     "ros2": 7,
@@ -42,6 +43,7 @@ COMPANION_LAYERS = {
 INTERFACES = (
     "companion.client",
     "companion.dashboard",
+    "companion.ground_station",
     "companion.language",
     "companion.mqtt",
     "companion.operator",
@@ -74,6 +76,7 @@ WORKSHOP = (
 PROGRAMS = (
     "companion.cli.run",
     "companion.dashboard.__main__",
+    "companion.ground_station.__main__",
     "companion.mqtt.__main__",
     "companion.perception.worker",
     "companion.recording.__main__",
@@ -156,6 +159,7 @@ AWAITED_TASKS = {
     "companion/cli/ask.py",
     "companion/cli/run.py",
     "companion/dashboard/chat.py",
+    "companion/ground_station/__main__.py",
     "companion/simulation/demo.py",
     "companion/language/serve.py",
     "companion/mqtt/__main__.py",

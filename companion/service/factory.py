@@ -137,13 +137,28 @@ def _clients(settings: Settings) -> Iterator[tuple[str, _Client]]:
     if settings.mqtt.url is not None or settings.mqtt.webhooks:
         options = {"mqtt": settings.mqtt.model_dump(mode="json"), "cameras": list(settings.cameras)}
         yield "mqtt", _Client("companion.mqtt", options)
+    if settings.ground_station.url is not None:
+        yield "ground_station", _Client("companion.ground_station", _ground_station_options(settings))
+
+
+def _ground_station_options(settings: Settings) -> dict[str, Any]:
+    cameras = {name: settings.of_camera(name).camera for name in (None, *settings.cameras)}
+    return {
+        "settings": settings.ground_station.model_dump(mode="json"),
+        "system_id": settings.vehicle.system_id,
+        "signing_key_file": settings.vehicle.signing_key_file,
+        "directory": settings.recording.directory or None,
+        "image_rate_hz": settings.preview.rate_hz,
+        "image_width": settings.preview.width,
+        "cameras": [{"name": name, "field_rad": camera.field_rad} for name, camera in cameras.items()],
+    }
 
 
 @asynccontextmanager
 async def clients_of(
     settings: Settings, on_event: Callable[[str, str], None], on_state: Callable[[str, str, bool], None]
 ) -> AsyncIterator[None]:
-    """Run meanwhile the clients that are set: the recorder, Foxglove live, and ROS 2 over zenoh.
+    """Run meanwhile the clients that are set: recorder, Foxglove live, ROS 2 over zenoh, ground station.
 
     Args:
         on_event: called with (level, text).

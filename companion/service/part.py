@@ -35,7 +35,7 @@ class Part:
     """What is known of a part. Times are CLOCK_MONOTONIC nanoseconds.
 
     Attributes:
-        name: autopilot, zenoh, camera, `camera NAME`, recorder, foxglove or ros2.
+        name: autopilot, zenoh, camera, `camera NAME`, recorder, foxglove, ros2 or ground_station.
         reason: why it is not ready; empty: it is, or it is not known yet.
         since_ns: begin of the state. next_try_ns: None: it is tried all the time, or needs no try.
     """

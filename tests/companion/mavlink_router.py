@@ -47,6 +47,11 @@ class MavlinkRouter:
         for endpoint in self._endpoints:
             loop.add_reader(endpoint.socket.fileno(), self._readable, endpoint)
 
+    def port(self, program: int) -> int:
+        """The router's own port towards a program, for one that does not listen."""
+        port: int = self._endpoints[program + 1].socket.getsockname()[1]
+        return port
+
     def close(self) -> None:
         for endpoint in self._endpoints:
             asyncio.get_running_loop().remove_reader(endpoint.socket.fileno())

@@ -256,6 +256,18 @@ async def test_targets_of_a_camera_that_is_gone_are_not_shown() -> None:
     assert service.status()["targets"] == {"camera": None, "count": 0, "localization_error": ""}
 
 
+async def test_station_link_is_a_part_that_names_a_port_in_use() -> None:
+    """And is tried again; nothing else waits for it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        url = f"udpin://127.0.0.1:{taken.getsockname()[1]}"
+        service = service_of(vehicle__url="none", ground_station__url=url)
+        async with running(service):
+            await service.parts.complete(1.0)
+            await until(lambda: url in reason(service, "ground_station"))
+            assert states(service)["ground_station"] == "retrying"
+
+
 async def test_recorder_is_a_part_that_waits_for_its_folder(tmp_path: Path) -> None:
     """And nothing else waits for it."""
     (tmp_path / "recordings").write_text("no folder")

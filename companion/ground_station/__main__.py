@@ -1,0 +1,178 @@
+"""The cameras of a vehicle for ground stations: `python -m companion.ground_station`, options as JSON."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, cast
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.bus.bodies.frames import CameraInfoBody
+from companion.bus.bodies.vehicle import VehicleBody
+from companion.bus.child_client import LISTENING, ChildClient, run_child
+from companion.bus.topics import CAMERA_INFO, EVENTS, STATUS, TRANSFORMS, VEHICLE
+from companion.ground_station import GroundStationError
+from companion.ground_station.camera import COMPONENT_IDS, Camera
+from companion.ground_station.captures import Captures
+from companion.ground_station.component import Message
+from companion.ground_station.feed import BusFeed
+from companion.ground_station.link import StationLink
+from companion.ground_station.positions import Positions
+from companion.ground_station.reports import ComputerStatus, StatusTexts
+from companion.host.peer_data import parse_object
+from companion.settings.operator import GroundStationSection
+from companion.vehicle.driver import LinkError
+from companion.vehicle.link_url import parse_link_url
+from companion.vehicle.signing import FrameSigner, read_key
+from vision.home import expanded
+
+_EVENTS_KEPT = 256
+_REPORT_NS = 10_000_000_000
+
+
+def _work(client: ChildClient) -> None:
+    asyncio.run(_run(client))
+
+
+async def _run(client: ChildClient) -> None:
+    options = client.options
+    section = GroundStationSection.model_validate(options["settings"], strict=False)
+    assert section.url is not None
+    directory = None if options["directory"] is None else expanded(options["directory"])
+    signing_key_file = options["signing_key_file"]
+    texts = StatusTexts()
+
+    def warn(text: str) -> None:
+        texts.add(mavlink.MAV_SEVERITY_WARNING, text, time.monotonic_ns())
+        client.say(text)
+
+    cameras = _cameras(options, directory, warn)
+    computer = ComputerStatus(Path.cwd() if directory is None else directory)
+    cameras[0].sources += [texts.due, computer.due]
+    link = StationLink(
+        parse_link_url(section.url),
+        options["system_id"],
+        cameras,
+        signer=None if signing_key_file is None else FrameSigner(read_key(signing_key_file)),
+        say=warn,
+    )
+    feed = BusFeed(client, options["vehicle"])
+    _subscribe(feed, cameras, texts)
+    cameras[0].sources.append(_report_losses(feed, texts, client.say))
+    open_parts: set[str] = set()
+
+    def on_open(part: str) -> None:
+        open_parts.add(part)
+        if open_parts == {"link", "bus"}:
+            ids = ", ".join(str(component.component_id) for component in link.components)
+            client.say(f"{LISTENING}at {section.url}, camera {ids} of system {options['system_id']}")
+
+    tasks = [
+        asyncio.create_task(link.run(partial(on_open, "link"))),
+        asyncio.create_task(asyncio.to_thread(feed.run, partial(on_open, "bus"))),
+        asyncio.create_task(client.ended()),
+    ]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
+    finally:
+        client.ending.set()
+        feed.close()
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+        for camera in cameras:
+            await asyncio.to_thread(camera.captures.close)
+
+
+def _cameras(options: dict[str, Any], directory: Path | None, warn: Callable[[str], None]) -> list[Camera]:
+    cameras = []
+    for component_id, about in zip(COMPONENT_IDS, options["cameras"], strict=False):
+        name = about["name"]
+        captures = Captures(directory, name or "camera", rate_hz=options["image_rate_hz"], warn=warn)
+        cameras.append(
+            Camera(
+                name,
+                component_id,
+                field_rad=about["field_rad"],
+                captures=captures,
+                positions=Positions(),
+                warn=warn,
+            )
+        )
+    return cameras
+
+
+def _subscribe(feed: BusFeed, cameras: list[Camera], texts: StatusTexts) -> None:
+    def on_status(_payload: bytes, _attachment: bytes | None) -> None:
+        for camera in cameras:
+            camera.on_status(time.monotonic_ns())
+
+    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
+        body = cast("VehicleBody", parse_object(payload))
+        for camera in cameras:
+            camera.positions.on_vehicle(body)
+
+    def on_event(payload: bytes, _attachment: bytes | None) -> None:
+        event = parse_object(payload)
+        texts.on_event(event["level"], event["text"], event["stamp_ns"], time.monotonic_ns())
+
+    feed.subscribe(STATUS, None, on_status)
+    feed.subscribe(VEHICLE, None, on_vehicle)
+    feed.subscribe(EVENTS, None, on_event, _EVENTS_KEPT)
+    for camera in cameras:
+        feed.subscribe(CAMERA_INFO, camera.name, partial(_on_camera_info, camera))
+        feed.subscribe(TRANSFORMS, camera.name, partial(_on_transforms, camera))
+        camera.sources.append(_images_while_wanted(feed, camera))
+
+
+def _report_losses(
+    feed: BusFeed, texts: StatusTexts, say: Callable[[str], None]
+) -> Callable[[int], list[Message]]:
+    reported, next_ns = (0, 0), 0
+
+    def due(now_ns: int) -> list[Message]:
+        nonlocal reported, next_ns
+        lost = feed.dropped, texts.lost
+        if lost != reported and now_ns >= next_ns:
+            messages, warnings = (new - old for new, old in zip(lost, reported, strict=True))
+            say(f"left out: {messages} messages of the bus, {warnings} warnings for stations")
+            reported, next_ns = lost, now_ns + _REPORT_NS
+        return []
+
+    return due
+
+
+def _on_camera_info(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:
+    camera.on_camera_info(cast("CameraInfoBody", parse_object(payload)))
+
+
+def _on_transforms(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:
+    camera.positions.on_transforms(payload)
+
+
+def _images_while_wanted(feed: BusFeed, camera: Camera) -> Callable[[int], list[Message]]:
+    """Return what subscribes to a camera's images while photos or a video are taken."""
+    subscribed = False
+
+    def on_image(jpeg: bytes, captured_ns: int) -> None:
+        camera.captures.on_image(jpeg, captured_ns, time.monotonic_ns())
+
+    def due(_now_ns: int) -> list[Message]:
+        nonlocal subscribed
+        if camera.captures.is_wanted != subscribed:
+            subscribed = not subscribed
+            feed.want_images(camera.name, "captures", on_image if subscribed else None)
+        return []
+
+    return due
+
+
+if __name__ == "__main__":
+    sys.exit(run_child(_work, refused=(GroundStationError, LinkError)))

@@ -1,0 +1,128 @@
+"""Messages of the bus on their way into the loop: bounded, the newest ones."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+from collections import deque
+from collections.abc import Callable
+from threading import Lock
+from typing import Any
+
+import zenoh
+
+from companion.bus.child_client import ChildClient
+from companion.bus.client import message_of, subscribe_kept
+from companion.bus.topics import IMAGE, Topic
+from companion.host.peer_data import PeerDataError, parse_object
+
+OnMessage = Callable[[bytes, bytes | None], None]
+"""Called in the loop with payload and attachment."""
+OnImage = Callable[[bytes, int], None]
+"""Called in the loop with a JPEG and its `captured_ns`."""
+
+_IMAGES_KEPT = 2
+_POLL_S = 0.5
+
+
+class BusFeed:
+    """Subscriptions of one vehicle. Its methods are called in the loop, except `run`.
+
+    Attributes:
+        dropped: messages that could not be used, or for which the loop was too slow.
+    """
+
+    def __init__(self, client: ChildClient, vehicle: str) -> None:
+        self.dropped = 0
+        self._client, self._vehicle = client, vehicle
+        self._loop = asyncio.get_running_loop()
+        self._topics: list[tuple[Topic, str | None, OnMessage, int]] = []
+        self._users: dict[str | None, dict[str, OnImage]] = {}
+        self._changes: queue.SimpleQueue[tuple[str | None, bool] | None] = queue.SimpleQueue()
+
+    def subscribe(self, topic: Topic, camera: str | None, on_message: OnMessage, kept: int = 16) -> None:
+        """Subscribe to a topic, before `run`. `kept`: messages that may wait for the loop."""
+        self._topics.append((topic, camera, on_message, kept))
+
+    def want_images(self, camera: str | None, user: str, on_image: OnImage | None) -> None:
+        """Begin to give the images of a camera to a user, or end it (None)."""
+        users = self._users.setdefault(camera, {})
+        before = bool(users)
+        if on_image is None:
+            users.pop(user, None)
+        else:
+            users[user] = on_image
+        if bool(users) != before:
+            self._changes.put((camera, bool(users)))
+
+    def run(self, on_open: Callable[[], None]) -> None:
+        """Open the bus, however late it comes, and keep the subscriptions until the end. In a thread."""
+        with self._client.open_bus() as session:
+            if session is None:
+                return
+            kept = [self._declare(session, *each) for each in self._topics]
+            self._loop.call_soon_threadsafe(on_open)
+            images: dict[str | None, Any] = {}
+            while not self._client.ending.is_set():
+                try:
+                    change = self._changes.get(timeout=_POLL_S)
+                except queue.Empty:
+                    continue
+                if change is None:
+                    break
+                camera, wanted = change
+                if wanted:
+                    receive = self._image_receiver(camera)
+                    images[camera] = self._declare(session, IMAGE, camera, receive, _IMAGES_KEPT)
+                else:
+                    images.pop(camera).undeclare()
+            kept.clear()
+
+    def close(self) -> None:
+        """End `run`."""
+        self._changes.put(None)
+
+    def _image_receiver(self, camera: str | None) -> OnMessage:
+        def on_message(jpeg: bytes, attachment: bytes | None) -> None:
+            captured_ns = int(parse_object(attachment or b"{}")["captured_ns"])
+            for on_image in tuple(self._users.get(camera, {}).values()):
+                on_image(jpeg, captured_ns)
+
+        return on_message
+
+    def _declare(
+        self, session: zenoh.Session, topic: Topic, camera: str | None, on_message: OnMessage, kept: int
+    ) -> Any:
+        waiting: deque[tuple[bytes, bytes | None]] = deque()
+        lock, scheduled = Lock(), False
+
+        def on_sample(sample: zenoh.Sample) -> None:
+            nonlocal scheduled
+            try:
+                message = message_of(sample, topic)
+            except PeerDataError:
+                self.dropped += 1
+                return
+            with lock:
+                waiting.append(message)
+                if len(waiting) > kept:
+                    waiting.popleft()
+                    self.dropped += not topic.of_camera  # of those only the newest matter
+                wake, scheduled = not scheduled, True
+            if wake and not self._loop.is_closed():
+                self._loop.call_soon_threadsafe(drain)
+
+        def drain() -> None:
+            nonlocal scheduled
+            with lock:
+                messages = tuple(waiting)
+                waiting.clear()
+                scheduled = False
+            for payload, attachment in messages:
+                try:
+                    on_message(payload, attachment)
+                except (ValueError, KeyError, TypeError):  # of another version
+                    self.dropped += 1
+
+        subscribe = subscribe_kept if topic.cached else zenoh.Session.declare_subscriber
+        return subscribe(session, topic.key(self._vehicle, camera), on_sample)
