@@ -84,7 +84,7 @@ def endpoint_from(language: LanguageSection) -> Endpoint | None:
 def read_api_key(path: Path) -> str:
     """Read `language.key_file`. Raises LanguageError."""
     try:
-        return read_secret(path, "language.key_file", shortest=0)
+        return read_secret(path, "language.key_file")
     except KeyFileError as error:
         raise LanguageError(str(error)) from error
 

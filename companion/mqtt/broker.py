@@ -19,6 +19,8 @@ from companion.host.restarts import Restarts
 from companion.mqtt import MqttError
 from companion.settings.key_files import KeyFileError, read_secret
 from companion.settings.operator import MqttSection
+from vision.file_kinds import explained
+from vision.text_file import NotUtf8Error, read_text
 
 ONLINE, OFFLINE = "online", "offline"
 MOST_EVENTS = 200
@@ -50,14 +52,31 @@ def broker_of(section: MqttSection) -> Broker:
     try:
         port = parts.port or _PORTS[parts.scheme]
         password = section.password_file and read_secret(Path(section.password_file), "mqtt.password_file")
-        tls = ssl.create_default_context(cafile=section.ca_file) if parts.scheme == "mqtts" else None
     except KeyFileError as error:
         raise MqttError(str(error)) from error
     except ValueError as error:
         raise MqttError(f"mqtt.url {section.url}: {error}") from error
-    except OSError as error:  # ssl.SSLError too
-        raise MqttError(f"mqtt.ca_file {section.ca_file}: {error.strerror or error}") from error
+    tls = _tls(section.ca_file) if parts.scheme == "mqtts" else None
     return Broker(parts.hostname or "", port, section.username, password, tls)
+
+
+def _tls(ca_file: str | None) -> ssl.SSLContext:
+    if ca_file is None:
+        return ssl.create_default_context()
+    path = Path(ca_file)
+    try:
+        text = read_text(path)
+    except NotUtf8Error:
+        text = ""
+    except OSError as error:
+        raise MqttError(f"mqtt.ca_file {path}: cannot be read: {error.strerror}") from error
+    wrong = f"mqtt.ca_file {explained(path, f'{path}: expected certificates of TLS, PEM')}"
+    if "BEGIN CERTIFICATE" not in text:  # without one the system's would be used
+        raise MqttError(wrong)
+    try:
+        return ssl.create_default_context(cadata=text)
+    except (ssl.SSLError, ValueError) as error:
+        raise MqttError(wrong) from error
 
 
 class BrokerLink:

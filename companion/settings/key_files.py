@@ -7,7 +7,7 @@ import stat
 from codecs import BOM_UTF8
 from pathlib import Path
 
-from vision.file_kinds import open_file
+from vision.file_kinds import kind_of_bytes, open_file
 
 _LONGEST_FILE_BYTES = 4 * 1024
 
@@ -43,8 +43,12 @@ def read_secret(path: Path, name: str, *, shortest: int = 1) -> str:
     except KeyFileError as error:
         raise KeyFileError(f"{name} {error}") from None
     secret = content.removeprefix(BOM_UTF8).decode("ascii", "replace").strip()
+    if content and (kind := kind_of_bytes(content)) is not None:
+        raise KeyFileError(f"{name} {path}: {kind}")
     if len(content) > _LONGEST_FILE_BYTES or not secret.isprintable() or "\ufffd" in secret:
         raise KeyFileError(f"{name} {path}: expected one line of ASCII")
+    if not secret and shortest == 1:
+        raise KeyFileError(f"{name} {path}: is empty")
     if len(secret) < shortest:
         raise KeyFileError(
             f"{name} {path}: expected at least {shortest} characters, got {len(secret)}; "

@@ -99,6 +99,10 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "zenoh.config_file": (("describe settings --check --zenoh-config-file {}", ".json5"),),
     "zenoh.child_config_file": (("describe settings --check --zenoh-child-config-file {}", ".json5"),),
     "dashboard.token_file": (("describe settings --check --dashboard-token-file {}", ".txt"),),
+    "mqtt.password_file": (
+        ("describe settings --check --mqtt-url mqtt://broker --mqtt-password-file {}", ".txt"),
+    ),
+    "mqtt.ca_file": (("describe settings --check --mqtt-url mqtts://broker --mqtt-ca-file {}", ".pem"),),
     "ground_station.video_token_file": (
         ("describe settings --check --ground-station-video-token-file {}", ".txt"),
     ),
@@ -184,7 +188,8 @@ ACCEPTED: dict[str, set[str]] = {name: kinds | {"fifo"} for name, kinds in _IMAG
     "source.depth": {"fifo"},
     "config": {"empty", "device"},
     "vehicle.signing_key_file": {"toml", "json"},
-    "language.key_file": {"toml", "json", "line"},
+    "language.key_file": {"json"},
+    "mqtt.password_file": {"json"},
     "log show paths": {"folder"},
 }
 _FOREIGN = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|Traceback|[Pp]rotobuf|\.cpp|site-packages|Errno")
