@@ -61,8 +61,9 @@ def mcp(
 
 def _access(listen: str, token_file: Path | None) -> Access:
     """Who may use HTTP. Raises DashboardError."""
-    from companion.dashboard.access import Access, DashboardError, is_loopback, read_token
+    from companion.dashboard.access import Access, DashboardError, read_token
     from companion.dashboard.server import split_listen
+    from companion.settings.key_files import is_loopback
 
     host, _ = split_listen(listen, "--listen")
     if not is_loopback(host):

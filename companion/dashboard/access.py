@@ -17,12 +17,12 @@ from http.cookies import CookieError, SimpleCookie
 from pathlib import Path
 from typing import NamedTuple
 
-from companion.settings.key_files import KeyFileError, read_secret
+from companion.settings import key_files
+from companion.settings.key_files import KeyFileError, is_loopback
 
 HEADER = "x-companion-dashboard"
 """A POST needs it, with any value: a page of another origin cannot send it without a CORS permission."""
 COOKIE = "companion_dashboard"
-SHORTEST_TOKEN = 16
 
 
 class DashboardError(RuntimeError):
@@ -36,30 +36,12 @@ class ErrorResponse(NamedTuple):
     text: str
 
 
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach a server on this host."""
-    if host == "localhost":
-        return True
-    address = _address(host)
-    return address is not None and address.is_loopback
-
-
 def read_token(path: str | Path, name: str = "dashboard.token_file") -> str:
-    """Read the token: one line of at least 16 printable characters, in a file readable by its owner only.
-
-    Args:
-        name: of the setting or option, for errors.
-
-    Raises:
-        DashboardError: the file or its content is not acceptable. The message never contains the token.
-    """
+    """Read the token, as `key_files.read_token` does. Raises DashboardError."""
     try:
-        token = read_secret(Path(path), name, shortest=SHORTEST_TOKEN)
+        return key_files.read_token(path, name)
     except KeyFileError as error:
         raise DashboardError(str(error)) from error
-    if " " in token:
-        raise DashboardError(f"{name} {path}: expected one line of ASCII without spaces")
-    return token
 
 
 @dataclass(frozen=True)

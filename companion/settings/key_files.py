@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import stat
 from codecs import BOM_UTF8
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from vision.file_kinds import kind_of_bytes, open_file
 
+SHORTEST_TOKEN = 16
 _LONGEST_FILE_BYTES = 4 * 1024
 
 
@@ -55,3 +57,26 @@ def read_secret(path: Path, name: str, *, shortest: int = 1) -> str:
             f"for example: openssl rand -hex 16 > {path}"
         )
     return secret
+
+
+def read_token(path: str | Path, name: str) -> str:
+    """Read the token of a server: a secret of at least 16 characters without spaces.
+
+    Args:
+        name: of the setting or option, for errors.
+
+    Raises:
+        KeyFileError: the file or its content is not acceptable.
+    """
+    token = read_secret(Path(path), name, shortest=SHORTEST_TOKEN)
+    if " " in token:
+        raise KeyFileError(f"{name} {path}: expected one line of ASCII without spaces")
+    return token
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach a server on this host; any other needs a token."""
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

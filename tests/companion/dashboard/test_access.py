@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from companion.dashboard.access import COOKIE, HEADER, Access, DashboardError, is_loopback, read_token
+from companion.dashboard.access import COOKIE, HEADER, Access, DashboardError, read_token
+from companion.settings.key_files import is_loopback
 from companion.settings.reading import ConfigurationError, load_settings
 
 TOKEN = "0123456789abcdef0123456789abcdef"
