@@ -39,6 +39,18 @@ ROS_READER = HERE / "companion" / "ros2" / "node_modules" / "@foxglove" / "rosms
 PYTHON_HEADER = Path(sysconfig.get_path("include"), "Python.h")
 # An implementation of rmw_zenoh's wire format; its requirements are of no other use.
 PYZEROS = HERE.parent / ".venv-pyzeros" / "bin" / "python"
+# Its server with the Python of the system, a player, and their codecs.
+GSTREAMER = (
+    *("python3-gi", "gir1.2-gst-rtsp-server-1.0", "gstreamer1.0-tools"),
+    *(f"gstreamer1.0-plugins-{kind}" for kind in ("base", "good", "bad")),
+)
+GSTREAMER_FILES = (
+    "bin/gst-launch-1.0",
+    "lib/python3/dist-packages/gi",
+    "lib/*/girepository-1.0/GstRtspServer-1.0.typelib",
+    "lib/*/gstreamer-1.0/libgstrtp.so",
+    "lib/*/gstreamer-1.0/libgstopenh264.so",
+)
 COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
 
 MAKE = "`make programs`, on Debian as root"
@@ -92,6 +104,11 @@ NEEDS = {
     "ROS 2 Jazzy": ros("Jazzy"),
     "ROS 2 Kilted": ros("Kilted"),
     "rosmsg2-serialization": Need(ROS_READER.is_dir(), "messages of ROS 2 as Foxglove reads them"),
+    "GStreamer": Need(
+        all(any(Path("/usr").glob(pattern)) for pattern in GSTREAMER_FILES),
+        "H.264, and video in a player of GStreamer",
+        debian=" ".join(GSTREAMER),
+    ),
     "autopilot": Need("COMPANION_SITL_URL" in os.environ, "SITL", "docs/how-to/sitl.md"),
     "test data": Need(DATA.is_dir(), "real flights, photographs and networks", "COMPANION_TEST_DATA"),
 }

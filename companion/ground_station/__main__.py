@@ -24,6 +24,7 @@ from companion.ground_station.feed import BusFeed
 from companion.ground_station.link import StationLink
 from companion.ground_station.positions import Positions
 from companion.ground_station.reports import ComputerStatus, StatusTexts
+from companion.ground_station.video import serving_video
 from companion.host.peer_data import parse_object
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.driver import LinkError
@@ -78,9 +79,11 @@ async def _run(client: ChildClient) -> None:
         asyncio.create_task(client.ended()),
     ]
     try:
-        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-        for task in done:
-            task.result()
+        images = options["image_width"], options["image_rate_hz"]
+        async with serving_video(section, cameras, feed, *images, warn):
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+            for task in done:
+                task.result()
     finally:
         client.ending.set()
         feed.close()

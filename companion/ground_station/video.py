@@ -1,0 +1,92 @@
+"""The cameras' video: two servers, what the cameras announce of them, and images while somebody watches."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager
+from functools import partial
+
+from pymavlink.dialects.v20 import common as mavlink
+
+from companion.ground_station import GroundStationError
+from companion.ground_station.camera import Camera, VideoStream
+from companion.ground_station.component import Message
+from companion.ground_station.feed import BusFeed
+from companion.ground_station.gstreamer import H264Server
+from companion.ground_station.rtsp import VideoServer, announced_host, announced_uri
+from companion.settings.key_files import KeyFileError, read_token
+from companion.settings.operator import GroundStationSection
+from companion.vehicle.link_url import LinkScheme, parse_link_url
+
+
+@asynccontextmanager
+async def serving_video(
+    section: GroundStationSection,
+    cameras: Sequence[Camera],
+    feed: BusFeed,
+    image_width: int,
+    rate_hz: float,
+    say: Callable[[str], None],
+) -> AsyncIterator[None]:
+    """Serve the cameras' video meanwhile, if `video_listen` is set. `image_width`, `rate_hz`: at most.
+
+    Raises:
+        GroundStationError: the token is missing or not acceptable, or an address is too long to be announced.
+        AddressTakenError: another program has the port.
+    """
+    if section.video_listen is None or section.url is None:
+        yield
+        return
+    try:
+        name = "ground_station.video_token_file"
+        token = None if section.video_token_file is None else read_token(section.video_token_file, name)
+    except KeyFileError as error:
+        raise GroundStationError(str(error)) from None
+    streams = {camera.name or "camera": camera for camera in cameras}
+    if len(streams) < len(cameras):
+        raise GroundStationError("a camera's name is `camera`, as the video of the first one: rename it")
+
+    pushes: dict[str, Callable[[str, bytes, int], None]] = {}
+
+    def want(kind: str, stream: str, wanted: bool) -> None:
+        feed.want_images(streams[stream].name, kind, partial(pushes[kind], stream) if wanted else None)
+
+    jpeg = VideoServer(
+        section.video_listen, streams, token=token, on_wanted=partial(want, "RTP/JPEG"), say=say
+    )
+    await jpeg.start()
+    h264 = H264Server(
+        jpeg.host,
+        jpeg.port + 1,
+        streams,
+        token=token,
+        on_wanted=partial(want, "H.264"),
+        say=say,
+    )
+    pushes |= {"RTP/JPEG": jpeg.push, "H.264": h264.push}
+    url = parse_link_url(section.url)
+    known = url.scheme in (LinkScheme.UDP_OUT, LinkScheme.TCP)
+    host = announced_host(jpeg.host, section.video_host, url.address[0] if known else "")
+
+    def announce(stream: str, camera: Camera, _now_ns: int = 0) -> list[Message]:
+        width = min(camera.size[0], image_width)
+        size = (width, round(camera.size[1] * width / camera.size[0])) if width else (0, 0)
+        uri = announced_uri(host, jpeg.port, jpeg.paths[stream])
+        found = [VideoStream(f"{stream} JPEG", uri, size, rate_hz=rate_hz)]
+        if h264.is_ready:
+            uri = announced_uri(host, h264.port, h264.paths[stream])
+            found.append(
+                VideoStream(f"{stream} H.264", uri, size, mavlink.VIDEO_STREAM_ENCODING_H264, rate_hz)
+            )
+        camera.streams = found
+        return []
+
+    try:
+        for stream, camera in streams.items():
+            announce(stream, camera)
+            camera.sources.append(partial(announce, stream, camera))
+        await h264.start()
+        yield
+    finally:
+        await h264.close()
+        await jpeg.close()
