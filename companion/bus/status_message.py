@@ -22,6 +22,7 @@ from companion.guidance.core import Guidance
 from companion.guidance.formation.neighbours import Neighbours
 from companion.guidance.gimbal.controller import GimbalController
 from companion.guidance.missions.sequence import SequenceBehaviour
+from companion.host.clock import unix_offset_ns
 from companion.perception.cameras import PerceptionCamera, WorkerCamera
 from companion.perception.supervisor import PerceptionSupervisor
 from companion.vehicle.autopilot_parameters import AutopilotParameters
@@ -63,6 +64,7 @@ def status_message(
     silence = setpoint_loss_outcome(parameters, sticks_present=state.sticks_present)
     return {
         "stamp_ns": now_ns,
+        "unix_offset_ns": unix_offset_ns(),
         "service": poses.source,
         "uptime_s": round(uptime_s, 1),
         "healthy": not unhealthy,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+from threading import Event
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -44,9 +45,9 @@ def node(
         print(with_load(line), flush=True)
 
     async def run(found: str) -> None:
-        ended = asyncio.Event()
-        _watch = on_ending(ended.set)
-        await run_node(settings, found, ros_arguments or (), ended, say)
+        ending = Event()
+        _watch = on_ending(ending.set)
+        await run_node(settings, found, ros_arguments or (), ending, say)
 
     if ros_arguments and ros_arguments[0] != "--ros-args":
         refuse(f"{ros_arguments[0]!r}: expected --ros-args after --")

@@ -28,6 +28,12 @@ def boottime_ns() -> int:
     return time.clock_gettime_ns(_BOOTTIME)
 
 
+def unix_offset_ns() -> int:
+    """Return the system clock minus CLOCK_MONOTONIC, nanoseconds. It changes where that clock is set."""
+    # A delay between the two readings makes the difference smaller.
+    return max(time.time_ns() - time.monotonic_ns() for _ in range(3))
+
+
 @dataclass(frozen=True, slots=True)
 class Standstill:
     """The computer or this process stood still.

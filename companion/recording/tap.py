@@ -18,6 +18,7 @@ from companion.bus.session import Bus
 from companion.bus.topics import GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK, RUN
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.interface import GuidanceInput, GuidanceOutput
+from companion.host.clock import unix_offset_ns
 from companion.recording.encoding import dumps, encode
 from companion.recording.guidance_record import LAYOUT, StepContext, input_record, output_record
 from companion.recording.link_bytes import LinkBytes, pack_link_bytes
@@ -51,7 +52,7 @@ def run_record(settings: Settings, options: GuidanceOptions, service: str) -> di
         "version": version("mavlink-companion"),
         "vehicle": settings.vehicle.name,
         "service": service,
-        "unix_offset_ns": time.time_ns() - time.monotonic_ns(),
+        "unix_offset_ns": unix_offset_ns(),
         "options": encode(GuidanceOptions, options),
         "settings": values,
     }

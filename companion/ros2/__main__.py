@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 
 import zenoh
@@ -13,9 +12,8 @@ import zenoh
 from companion.bus.child_client import LISTENING, PAUSED, ChildClient, open_patiently, run_child
 from companion.bus.client import client_settings
 from companion.ros2.dialect import NodeName, ZenohNode
-from companion.ros2.gateway import Gateway, ServiceClock, follow_service, namespace_of
-from companion.ros2.messages import OUTPUT_TOPICS, Messages, frame_prefix
-from companion.ros2.requests import Requests
+from companion.ros2.gateway import ServiceClock
+from companion.ros2.wiring import connected, namespace_of
 from companion.settings import Settings, ZenohSection
 
 _WATCH_S = 0.5
@@ -27,43 +25,23 @@ class _DomainError(ValueError):
 
 
 def _work(client: ChildClient) -> None:
+    """Run the nodes until the service ends."""
     options = client.options
     settings = Settings.model_validate({"vehicle": {"name": options["vehicle"]}, "ros2": options["settings"]})
-    name = NodeName(_domain_id(settings), namespace_of(settings), settings.ros2.node_name)
-    _run(settings, client, name)
-
-
-def _run(settings: Settings, client: ChildClient, name: NodeName) -> None:
-    ros2, vehicle = settings.ros2, settings.vehicle.name
-    say, no_router = client.say, f"no zenoh router at {ros2.router}"
+    ros2, say, namespace = settings.ros2, client.say, namespace_of(settings)
+    name, no_router = (
+        NodeName(_domain_id(settings), namespace, ros2.node_name),
+        f"no zenoh router at {ros2.router}",
+    )
     with ExitStack() as stack:
         bus = stack.enter_context(client.open_bus())
         router = client_settings(ZenohSection(), (ros2.router,))
         session = stack.enter_context(open_patiently(router, client.ending, say, no_router))
         if bus is None or session is None:
             return
-        clock = ServiceClock(client.zenoh)
-        gateway = Gateway(bus, vehicle, Messages(frame_prefix(name.namespace), clock.ros_time_ns), say)
-        stack.callback(gateway.close)
         plain = [kind for kind, used in ((False, ros2.rmw_zenoh), (True, ros2.plain_keys)) if used]
-        nodes = [ZenohNode(session, name, plain=kind, want=gateway.want, say=say) for kind in plain]
-
-        def publish_result(cdr: bytes) -> None:
-            for node in nodes:
-                node.send("~/result", cdr)
-
-        def offer(cameras: Sequence[str]) -> None:
-            for camera in set(cameras) - known:
-                known.add(camera)
-                for node in nodes:
-                    node.offer([topic for topic in OUTPUT_TOPICS if topic.source.of_camera], camera)
-
-        known: set[str] = set()
-        requests = Requests(bus, vehicle, commands=ros2.commands, publish_result=publish_result, say=say)
-        for node in nodes:
-            node.declare(*requests.topics())
-            node.offer(OUTPUT_TOPICS, None)
-        stack.callback(follow_service(bus, vehicle, clock, offer).clear)
+        nodes = [ZenohNode(session, name, plain=kind, say=say) for kind in plain]
+        stack.enter_context(connected(bus, settings, namespace, ServiceClock(), nodes, say))
         routed = None
         while not client.ending.is_set():
             if (now := bool(session.info.routers_zid())) is not routed:

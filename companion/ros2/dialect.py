@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -27,10 +27,7 @@ from companion.bus.config import first_line
 from companion.bus.topics import LARGEST_JSON_BYTES
 from companion.host.peer_data import copy_payload
 from companion.ros2.definitions import type_hash
-from companion.ros2.gateway import Losses, NodeTopic, Sink
-from companion.ros2.messages import RosTopic
-
-Want = Callable[[Sink, RosTopic, str | None, bool], None]
+from companion.ros2.gateway import Losses, NodeTopic
 
 _CDR, _DROP = zenoh.Encoding.APPLICATION_CDR, zenoh.CongestionControl.DROP
 _GID_BYTES = 16
@@ -112,24 +109,21 @@ def _qos(topic: NodeTopic) -> str:
 
 
 class ZenohNode:
-    """A node on a session of zenoh, as a sink of the gateway.
+    """A node on a session of zenoh, for the gateway.
 
     zenoh itself declares everything again when a router that was lost is back.
 
     Args:
         session: of a client of the router.
         plain: with plain keys; else as rmw_zenoh.
-        want: `Gateway.want`; called from any thread.
         say: called with a line.
     """
 
     def __init__(
-        self, session: zenoh.Session, name: NodeName, *, plain: bool, want: Want, say: Callable[[str], None]
+        self, session: zenoh.Session, name: NodeName, *, plain: bool, say: Callable[[str], None]
     ) -> None:
         self._session, self._name, self._plain, self._say = session, name, plain, say
-        self._want, self._losses = want, Losses(say)
-        self._zid = str(session.zid())
-        self._offered: dict[str, list[tuple[RosTopic, str | None]]] = {}
+        self._losses, self._zid = Losses(say), str(session.zid())
         self._publishers: dict[str, _Publisher] = {}
         self._kept: list[object] = []  # tokens, subscribers and listeners
         self._matching = Lock()
@@ -139,18 +133,11 @@ class ZenohNode:
                 session.liveliness().declare_subscriber(name.token("*"), self._on_node, history=True),
             ]
 
-    def offer(self, topics: Sequence[RosTopic], camera: str | None) -> None:
-        """Publish what is made of topics of the bus while there is a subscriber."""
-        for topic in topics:
-            made = NodeTopic.made_of(topic, camera)
-            self._offered.setdefault(made.name, []).append((topic, camera))
-            if made.name not in self._publishers:
-                self.declare(made)
-            self._on_matching(made.name)
-
     def declare(self, *topics: NodeTopic) -> None:
-        """Publish topics, or subscribe to them."""
+        """Publish topics, or subscribe to them. One that is declared already stays as it is."""
         for topic in topics:
+            if topic.name in self._publishers:
+                continue
             key, gid = self._name.plain_key(topic.name), None
             if not self._plain:
                 key = self._name.rmw_key(topic.name, topic.type_name)
@@ -158,29 +145,27 @@ class ZenohNode:
                 self._kept.append(self._session.liveliness().declare_token(token))
                 # rmw_zenoh has another hash of the token: all that counts is that no publisher shares it.
                 gid = hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
-            if topic.on_serialized is None:
-                publisher = self._publishers[topic.name] = _Publisher(self._session, key, topic, gid)
-                on_matching = partial(self._on_matching, topic.name)
-                self._kept.append(publisher.plain.declare_matching_listener(on_matching))
-            else:
+            if topic.on_serialized is not None:
                 self._kept.append(self._session.declare_subscriber(key, partial(self._on_sample, topic)))
-
-    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
-        """Publish CDR, as the sink of the gateway."""
-        self.send(name, payload)
+                continue
+            publisher = self._publishers[topic.name] = _Publisher(self._session, key, topic, gid)
+            if topic.on_wanted is not None:
+                on_matching = partial(self._on_matching, publisher.plain, topic.on_wanted)
+                self._kept.append(publisher.plain.declare_matching_listener(on_matching))
+                on_matching()
 
     def send(self, name: str, payload: bytes) -> None:
         """Publish CDR on a declared topic, from any thread. Never raises for the network."""
         try:
             self._publishers[name].put(payload)
         except zenoh.ZError as error:
-            self._losses.add(f"{name}: {first_line(error)}")
+            self._losses.add(name, f"{name}: message left out: {first_line(error)}")
 
-    def _on_matching(self, name: str, _: zenoh.MatchingStatus | None = None) -> None:
+    def _on_matching(
+        self, publisher: zenoh.Publisher, on_wanted: Callable[[bool], None], _: object = None
+    ) -> None:
         with self._matching:  # zenoh's threads may overtake each other: what holds now is read again
-            status = self._publishers[name].plain.matching_status
-            for topic, camera in self._offered.get(name, ()):
-                self._want(self, topic, camera, bool(status.matching))  # type: ignore[attr-defined]
+            on_wanted(bool(publisher.matching_status.matching))  # type: ignore[attr-defined]
 
     def _on_sample(self, topic: NodeTopic, sample: zenoh.Sample) -> None:
         assert topic.on_serialized is not None
@@ -188,7 +173,7 @@ class ZenohNode:
             payload = memoryview(copy_payload(sample.payload, LARGEST_JSON_BYTES))
             topic.on_serialized(topic.name, topic.type_name, payload, time.monotonic_ns(), time.time_ns())
         except Exception as error:  # no message may end the thread
-            self._losses.add(f"{topic.name}: {error}")
+            self._losses.add(topic.name, f"{topic.name}: message left out: {error}")
 
     def _on_node(self, sample: zenoh.Sample) -> None:
         if sample.kind == zenoh.SampleKind.PUT and str(sample.key_expr) != self._name.token(self._zid):

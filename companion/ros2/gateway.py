@@ -1,11 +1,10 @@
-"""From the bus to ROS: subscribes to a topic of the bus only while a sink wants what is made of it."""
+"""From the bus to ROS: subscribes to a topic of the bus only while a node wants what is made of it."""
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from threading import Lock
@@ -14,25 +13,15 @@ from typing import Any, Protocol
 import zenoh
 
 from companion.bus.client import message_of, subscribe_kept
-from companion.bus.topics import RUN, STATUS
-from companion.host.peer_data import parse_object
-from companion.ros2.messages import Messages, RosTopic, ros_name, topic_name
-from companion.settings import Settings, ZenohSection
+from companion.bus.topics import Topic
+from companion.host.clock import unix_offset_ns
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, topic_name
 
-# A status is younger than this where it is received. Its stamp is of another clock if it is not.
-_STATUS_AGE_NS = 2_000_000_000
-_THIS_HOST = re.compile(r"/(127\.|localhost|\[::1\])")
-_WARN_INTERVAL_S = 10.0
+_SAID_INTERVAL_S = 60.0
 # Of a text or a velocity.
 LARGEST_REQUEST_BYTES = 64 * 1024
 _STAMPS_KEPT = 512  # of some seconds: images come after their detections
-
-
-def namespace_of(settings: Settings) -> str:
-    """Return the namespace of a vehicle's topics, without an outer `/`; empty: none."""
-    given = settings.ros2.namespace
-    return ros_name(settings.vehicle.name) if given is None else given
-
+_SAME_CLOCK_NS = 1_000_000  # two readings of one pair of clocks differ by less
 
 OnSerialized = Callable[[str, str, memoryview, int, int], None]
 """(topic name, type name, CDR, received_ns, ros_now_ns): a message that a node received.
@@ -47,6 +36,7 @@ class NodeTopic:
 
     Attributes:
         name: relative to the namespace, absolute, or of the node, as `~/result`.
+        on_wanted: called, from any thread, with whether a published topic has a subscriber now.
         latched: transient local.
         reliable: else best effort. A subscription that is not reliable accepts all publishers.
         adapts: this subscription becomes reliable where all publishers are: large images need it. A velocity
@@ -57,48 +47,32 @@ class NodeTopic:
     name: str
     type_name: str
     on_serialized: OnSerialized | None = None
+    on_wanted: Callable[[bool], None] | None = None
     reliable: bool = True
     latched: bool = False
     depth: int = 10
     adapts: bool = False
     largest_bytes: int = LARGEST_REQUEST_BYTES
 
-    @staticmethod
-    def made_of(topic: RosTopic, camera: str | None) -> NodeTopic:
-        """Return the topic to publish for one of the bus. `camera`: as of `topic_name`."""
-        name, depth = topic_name(topic, camera), 1 if topic.latched else 10
-        return NodeTopic(name, topic.type_name, None, topic.reliable, topic.latched, depth)
-
 
 class ServiceClock:
     """ROS time of the stamps of a service: system time, or simulated time while there is one.
 
-    Its stamps are CLOCK_MONOTONIC of its host. On this host the present difference to the system clock is
-    used, which may be set meanwhile; of another host that at the start of its service. A frame of
-    a camera of ROS has exactly the stamp of its image.
-
-    Args:
-        zenoh: settings of a client; the endpoint says whether the service may be on this host.
+    Its stamps are CLOCK_MONOTONIC of its host. Where that is this one, a system clock that is set has effect
+    at once, else with the next status, which comes once a second. A stamp that has a ROS time keeps it. A
+    frame of a camera of ROS has exactly the stamp of its image.
     """
 
-    def __init__(self, zenoh: ZenohSection) -> None:
-        self._may_be_here = all(map(_THIS_HOST.search, zenoh.connect))
-        self._here = self._may_be_here
-        self._there_ns: int | None = None  # Unix time minus CLOCK_MONOTONIC of the service
+    def __init__(self) -> None:
+        self._ahead_ns = 0  # CLOCK_MONOTONIC of this host minus that of the service's
         self._simulated_ns: int | None = None  # simulated time minus CLOCK_MONOTONIC of this host
         self._given: dict[int, int] = {}
         self._of_images: dict[int, int] = {}
 
-    def on_status(self, stamp_ns: int) -> None:
-        """Process the stamp of a status, when it is received."""
-        here = self._may_be_here and abs(time.monotonic_ns() - stamp_ns) < _STATUS_AGE_NS
-        if here != self._here:
-            self._here, self._given = here, {}
-
-    def on_run(self, unix_offset_ns: int) -> None:
-        """Process the difference of the clocks of the service's host."""
-        if unix_offset_ns != self._there_ns:
-            self._there_ns, self._given = unix_offset_ns, {}
+    def on_status(self, service_offset_ns: int) -> None:
+        """Process `unix_offset_ns` of a status, when it is received."""
+        ahead_ns = service_offset_ns - unix_offset_ns()
+        self._ahead_ns = 0 if abs(ahead_ns) < _SAME_CLOCK_NS else ahead_ns
 
     def on_ros_time(self, monotonic_ns: int, ros_ns: int, simulated: bool) -> None:
         """Process a reading of this host's CLOCK_MONOTONIC and of the clock of ROS."""
@@ -118,17 +92,10 @@ class ServiceClock:
         """
         given = self._of_images.get(stamp_ns, self._given.get(stamp_ns))
         if given is None:
-            given = self._computed_ns(stamp_ns)
+            offset_ns = unix_offset_ns() if self._simulated_ns is None else self._simulated_ns
+            given = max(0, stamp_ns + self._ahead_ns + offset_ns)
             _keep(self._given, stamp_ns, given)
         return given
-
-    def _computed_ns(self, stamp_ns: int) -> int:
-        offset_ns = _unix_offset_ns()
-        if not self._here and self._there_ns is not None:
-            stamp_ns += self._there_ns - offset_ns
-        if self._simulated_ns is not None:
-            offset_ns = self._simulated_ns
-        return max(0, stamp_ns + offset_ns)
 
 
 def _keep(stamps: dict[int, int], stamp_ns: int, ros_ns: int) -> None:
@@ -137,121 +104,134 @@ def _keep(stamps: dict[int, int], stamp_ns: int, ros_ns: int) -> None:
         stamps.pop(next(iter(stamps)), None)
 
 
-def _unix_offset_ns() -> int:
-    return time.time_ns() - time.monotonic_ns()
-
-
 class Losses:
-    """Counts messages that cannot be used, and says why, at most every 10 s."""
+    """Counts messages that cannot be used as they are, and says why: the first of a kind, then once a minute.
+
+    Attributes:
+        counts: by kind.
+    """
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        self._say, self._count, self._said_s = say, 0, -_WARN_INTERVAL_S
+        self.counts: Counter[str] = Counter()
+        self._say = say
+        self._said: dict[str, tuple[float, int]] = {}  # when, and of how many
 
-    def add(self, text: str) -> None:
-        """Count a message: of another version, another program's, or too large."""
-        self._count += 1
-        if time.monotonic() - self._said_s >= _WARN_INTERVAL_S:
-            more = f" ({self._count - 1} more before)" if self._count > 1 else ""
-            self._said_s, self._count = time.monotonic(), 0
-            self._say(f"message left out: {' '.join(text.split())[:200]}{more}")
+    def add(self, kind: str, text: str) -> None:
+        """Count a message: of another version, another program's, too large, too old."""
+        self.counts[kind] += 1
+        said_s, said = self._said.get(kind, (-_SAID_INTERVAL_S, 0))
+        if time.monotonic() - said_s >= _SAID_INTERVAL_S:
+            before = self.counts[kind] - said - 1
+            self._said[kind] = time.monotonic(), self.counts[kind]
+            more = f" ({before} more before)" if before else ""
+            self._say(f"{' '.join(text.split())[:300]}{more}")
 
 
-class Sink(Protocol):
-    """Where CDR goes: the node, or nodes with rmw_zenoh."""
+class Node(Protocol):
+    """Where CDR goes: the node of rclpy, or one on zenoh."""
 
-    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
-        """Publish, from any thread. `name`: of `topic_name`."""
+    def declare(self, *topics: NodeTopic) -> None:
+        """Publish topics, or subscribe to them. One that is declared already stays as it is."""
+        ...
+
+    def send(self, name: str, payload: bytes) -> None:
+        """Publish on a declared topic, from any thread. `name`: of its `NodeTopic`."""
         ...
 
 
 class Gateway:
-    """Converts the messages of one vehicle that sinks want. All methods may be called from any thread.
+    """Converts the messages of one vehicle that nodes want. All methods may be called from any thread.
 
     Args:
-        say: called with a line, at most every 10 s, on messages that cannot be converted.
+        say: called with a line on messages that cannot be converted, as by `Losses`.
     """
 
     def __init__(
-        self, session: zenoh.Session, vehicle: str, messages: Messages, say: Callable[[str], None]
+        self,
+        session: zenoh.Session,
+        vehicle: str,
+        messages: Messages,
+        nodes: Sequence[Node],
+        say: Callable[[str], None],
     ) -> None:
-        self._session, self._vehicle, self._messages = session, vehicle, messages
-        # Of each topic of the bus: what is made of it, and the sinks of that.
-        self._wanted: dict[tuple[str, str | None], list[tuple[Sink, RosTopic]]] = {}
-        self._subscribers: dict[tuple[str, str | None], Any] = {}
+        self._session, self._vehicle, self._messages, self._nodes = session, vehicle, messages, nodes
+        # Both are replaced, never changed: zenoh's threads read them without the lock.
+        self._offered: tuple[tuple[str, RosTopic, str | None], ...] = ()  # name in a node; camera
+        self._wanted: frozenset[tuple[Node, str]] = frozenset()
+        self._subscribers: dict[str, Any] = {}  # by the path of the bus's topic
         self._lock, self._converting = Lock(), Lock()
         self._losses = Losses(say)
 
-    def want(self, sink: Sink, topic: RosTopic, camera: str | None, wanted: bool) -> None:
-        """Begin or end a topic for a sink. `camera`: None for the first, and for topics of no camera."""
-        key = topic.source.name, camera
+    def offer(self, camera: str | None) -> None:
+        """Publish, while a node wants it, what is made of a further camera; None: everything else."""
+        topics = [topic for topic in OUTPUT_TOPICS if camera is None or topic.source.of_camera]
+        offered = [(topic_name(topic, camera), topic, camera) for topic in topics]
         with self._lock:
-            users = self._wanted.setdefault(key, [])
-            if ((sink, topic) in users) == wanted:
-                return
-            if wanted:
-                users.append((sink, topic))
-            else:
-                users.remove((sink, topic))
-            ended = None if users else self._subscribers.pop(key, None)
-            if users and key not in self._subscribers:
-                subscribe = subscribe_kept if topic.source.cached else zenoh.Session.declare_subscriber
-                path = topic.source.key(self._vehicle, camera)
-                receive = partial(self._on_sample, topic, camera)
-                self._subscribers[key] = subscribe(self._session, path, receive)
-        if ended is not None:
-            ended.undeclare()
+            self._offered += tuple(offered)
+        for node in self._nodes:
+            node.declare(
+                *(
+                    NodeTopic(
+                        name,
+                        topic.type_name,
+                        on_wanted=partial(self._on_wanted, node, name),
+                        reliable=topic.reliable,
+                        latched=topic.latched,
+                        depth=1 if topic.latched else 10,
+                    )
+                    for name, topic, _ in offered
+                )
+            )
+        self._follow()  # a topic of all cameras may be wanted already
 
     def close(self) -> None:
         """End all subscriptions."""
         with self._lock:
-            ended = list(self._subscribers.values())
-            self._subscribers.clear()
-            self._wanted.clear()
+            self._offered = ()
+        self._follow()
+
+    def _on_wanted(self, node: Node, name: str, wanted: bool) -> None:
+        with self._lock:
+            change = {(node, name)}
+            self._wanted = self._wanted | change if wanted else self._wanted - change
+        self._follow()
+
+    def _follow(self) -> None:
+        """Subscribe to what wanted topics are made of, and to nothing else."""
+        with self._lock:
+            names = {name for _, name in self._wanted}
+            wanted = {
+                topic.source.path(camera): (topic.source, camera)
+                for name, topic, camera in self._offered
+                if name in names
+            }
+            ended = [self._subscribers.pop(path) for path in self._subscribers.keys() - wanted.keys()]
+            for path in wanted.keys() - self._subscribers.keys():
+                source, camera = wanted[path]
+                subscribe = subscribe_kept if source.cached else zenoh.Session.declare_subscriber
+                receive = partial(self._on_sample, source, camera)
+                self._subscribers[path] = subscribe(self._session, source.key(self._vehicle, camera), receive)
         for subscriber in ended:
             subscriber.undeclare()
 
-    def _on_sample(self, first: RosTopic, camera: str | None, sample: zenoh.Sample) -> None:
-        users = tuple(self._wanted.get((first.source.name, camera), ()))
+    def _on_sample(self, source: Topic, camera: str | None, sample: zenoh.Sample) -> None:
+        wanted, path = self._wanted, source.path(camera)
         try:
-            payload, attachment = message_of(sample, first.source)
+            payload, attachment = message_of(sample, source)
         except (ValueError, KeyError, TypeError) as error:
-            self._losses.add(f"{first.source.path(camera)}: {error}")
+            self._losses.add(path, f"{path}: message left out: {error}")
             return
-        made: dict[str, bytes | None] = {}
+        made = []
         with self._converting:
-            for _, topic in users:
-                if topic.name in made:
+            for name, topic, of_camera in self._offered:
+                nodes = [node for node in self._nodes if (node, name) in wanted]
+                if not nodes or topic.source is not source or of_camera != camera:
                     continue
                 try:
-                    made[topic.name] = self._messages.convert(topic, camera, payload, attachment)
+                    cdr = self._messages.convert(topic, camera, payload, attachment)
                 except ValueError as error:
-                    made[topic.name] = None
-                    self._losses.add(f"{first.source.path(camera)}: {error}")
-        for sink, topic in users:
-            if (cdr := made[topic.name]) is not None:
-                sink.publish(topic_name(topic, camera), topic, cdr)
-
-
-def follow_service(
-    session: zenoh.Session, vehicle: str, clock: ServiceClock, on_cameras: Callable[[list[str]], None]
-) -> list[Any]:
-    """Keep the clock, and call back with the names of the further cameras, as the service is seen.
-
-    Returns:
-        Subscribers, to be kept meanwhile.
-    """
-
-    def on_status(sample: zenoh.Sample) -> None:
-        with suppress(ValueError, KeyError, TypeError):  # of another version
-            status = parse_object(message_of(sample, STATUS)[0])
-            clock.on_status(status["stamp_ns"])
-            on_cameras(list(status["cameras"]))
-
-    def on_run(sample: zenoh.Sample) -> None:
-        with suppress(ValueError, KeyError, TypeError):
-            clock.on_run(int(parse_object(message_of(sample, RUN)[0])["unix_offset_ns"]))
-
-    return [
-        subscribe_kept(session, STATUS.key(vehicle), on_status),
-        session.declare_subscriber(RUN.key(vehicle), on_run),
-    ]
+                    self._losses.add(name, f"{path}: message left out: {error}")
+                else:
+                    made += [(node, name, cdr) for node in nodes if cdr is not None]
+        for node, name, cdr in made:
+            node.send(name, cdr)

@@ -6,7 +6,6 @@ whose name has a word that begins with `image_rect`, as `image_rect/compressed`.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from companion.ros2 import cdr
+from companion.ros2.gateway import Losses
 from vision.calibration_files.lens_names import distortion_name
 from vision.camera_model import CameraCalibration, CameraModel, scaled_to_frames
 from vision.image_file import decode, frame_pixels, stated_size
@@ -54,9 +54,6 @@ _COMPRESSED_DEPTH_HEADER = 12  # bytes, compression_common.h: only 32FC1 needs i
 _MOST_PIXELS = 1 << 25
 _OLDEST_NS = 60_000_000_000  # an older stamp is of another clock; a newer one may be of a slow network
 _AHEAD_NS = 50_000_000  # drivers' clocks and the steps of /clock run ahead so far
-_RETRY_NS = 1_000_000_000  # of a shared memory that cannot be created
-_STATUS_NS = 60_000_000_000
-_LONGEST_REASON = 200  # characters: a message's texts can have any length
 
 
 class RosCamera:
@@ -68,8 +65,7 @@ class RosCamera:
 
     Args:
         address: its topic, and that of its lens; without depth, which is a camera of its own.
-        report: called with one line at the first problem of each kind, and with `status` each minute in which
-            there were more.
+        report: called with a line, as by `Losses`.
         on_frame: called with `captured_ns` and the header's stamp, nanoseconds, before readers see a frame
             whose stamp is used: messages about the frame can then have the stamp of its image.
 
@@ -87,14 +83,13 @@ class RosCamera:
         if address.info is not None:
             self.topics[address.info] = CAMERA_INFO
         self.address = address
-        self.problems: Counter[str] = Counter()
-        self._report, self._on_frame = report, on_frame
+        self._losses, self._on_frame = Losses(report), on_frame
+        self.problems = self._losses.counts
         self._writer: SharedFrameWriter | None = None
         self._lens: CameraModel | None = None
         self._info = b""
-        self._stamp_ns = self._captured_ns = self._failed_ns = self._said_ns = 0
-        self._received = self._written = 0
-        self._unsaid = self._closed = False
+        self._stamp_ns = self._captured_ns = self._received = 0
+        self._closed = False
         self._lock = Lock()
 
     def on_serialized(
@@ -116,20 +111,7 @@ class RosCamera:
                     self._on_image(cdr.decode(type_name, payload), received_ns, ros_now_ns)
             except (ValueError, SourceError, cv2.error) as error:
                 kind = "encoding" if isinstance(error, _UnknownEncodingError) else "message"
-                self._problem(kind, f"{type_name} is not used: {' '.join(str(error).split())}")
-            self._said_ns = self._said_ns or received_ns
-            if self._unsaid and received_ns - self._said_ns >= _STATUS_NS:
-                self._unsaid, self._said_ns = False, received_ns
-                self._report(self.status(received_ns))
-
-    def status(self, now_ns: int) -> str:
-        """Return what was received and what was not used, in one line. `now_ns`: CLOCK_MONOTONIC."""
-        text = f"{self.address.image}: {self._written} frames"
-        if (writer := self._writer) is not None:
-            age_ms = (now_ns - self._captured_ns) / 1e6
-            text += f", {writer.width}x{writer.height}, the newest {age_ms:.0f} ms old"
-        counts = ", ".join(f"{count} {kind}" for kind, count in sorted(self.problems.items()))
-        return f"{text}; problems: {counts}" if counts else text
+                self._problem(kind, f"{type_name} is not used: {error}")
 
     def close(self) -> None:
         """Remove the shared memory, from any thread. Later messages are ignored."""
@@ -151,7 +133,7 @@ class RosCamera:
         pixels, conversion, is_depth = (_compressed if "format" in message else _raw)(message)
         scale_m = INTEGER_SCALE_M if pixels.dtype.kind == "u" else FLOAT_SCALE_M
         depth_m = to_metres(pixels, scale_m) if is_depth else None
-        writer = self._writer_for((pixels.shape[1], pixels.shape[0]), is_depth, received_ns)
+        writer = self._writer_for((pixels.shape[1], pixels.shape[0]), is_depth)
         if writer is None:
             return
         self._captured_ns = max(captured_ns, self._captured_ns + 1)  # trackers need it to increase
@@ -164,7 +146,6 @@ class RosCamera:
                 image[:] = pixels
             else:
                 cv2.cvtColor(pixels, conversion, dst=image)
-        self._written += 1
 
     def _capture(
         self, stamp: Mapping[str, int], received_ns: int, ros_now_ns: int
@@ -198,22 +179,18 @@ class RosCamera:
             rectified = "/image_rect" in self.address.image
             lens = lens_of(cdr.decode(CAMERA_INFO, payload), rectified=rectified)
         except ValueError as error:
-            why = " ".join(str(error).split())[:_LONGEST_REASON]
-            self._problem("lens", f"no lens is used: {self.address.info}: {why}")
+            self._problem("lens", f"no lens is used: {self.address.info}: {error}")
         if lens != self._lens:
             self._lens = lens
             self._remove()
 
-    def _writer_for(self, size: tuple[int, int], depth: bool, now_ns: int) -> SharedFrameWriter | None:
+    def _writer_for(self, size: tuple[int, int], depth: bool) -> SharedFrameWriter | None:
         """The writer of such frames; None: there can be none now."""
         writer = self._writer
         if writer is not None and (writer.width, writer.height, writer.depth) == (*size, depth):
             return writer
         if self.address.info is not None and not self._info:
             self._problem("info", f"the images wait for {self.address.info}: no message yet")
-            return None
-        if self._failed_ns and now_ns - self._failed_ns < _RETRY_NS:
-            self._problem("memory", "")
             return None
         self._remove()
         calibration = None
@@ -225,16 +202,11 @@ class RosCamera:
         try:
             self._writer = SharedFrameWriter(self.address.segment, *size, depth, calibration=calibration)
         except (OSError, ValueError) as error:
-            self._failed_ns = now_ns
             self._problem("memory", f"the images cannot be shared: {error}")
         return self._writer
 
     def _problem(self, kind: str, text: str) -> None:
-        self.problems[kind] += 1
-        if self.problems[kind] == 1:
-            self._report(f"{self.address.image}: {text}; said once, counted as {kind!r}")
-        else:
-            self._unsaid = True
+        self._losses.add(kind, f"{self.address.image}: {text}")
 
 
 def ros_cameras(

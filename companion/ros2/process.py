@@ -12,38 +12,26 @@ import sys
 from asyncio.subprocess import PIPE, STDOUT, Process
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from functools import partial
 from pathlib import Path
-from threading import Lock, RLock, Thread
+from threading import Event, RLock, Thread
 from typing import Any
 
-import zenoh
-
-from companion.bus.client import NoAnswerError, client_settings, open_client
+from companion.bus.child_client import open_patiently
+from companion.bus.client import client_settings
 from companion.bus.topics import LARGEST_BINARY_BYTES
 from companion.host.child_process import supervised
 from companion.ros2 import node as protocol
-from companion.ros2.gateway import (
-    Gateway,
-    Losses,
-    NodeTopic,
-    ServiceClock,
-    follow_service,
-    namespace_of,
-)
+from companion.ros2.gateway import Losses, NodeTopic, ServiceClock
 from companion.ros2.images import ros_cameras
-from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_prefix
-from companion.ros2.requests import Requests
-from companion.settings import Settings, ZenohSection
-
-OnWanted = Callable[[RosTopic, str | None, bool], None]
+from companion.ros2.wiring import connected, namespace_of
+from companion.settings import Settings
 
 # A node without a sign of life for so long is killed, and started again.
 SILENT_S = 10.0
 _PROBE_S = 30.0
 # One that was killed is listed by the others for up to 20 s (the lease of DDS).
 NAMESAKE_S = 25.0
-_RETRY_S, _END_S = 2.0, 5.0
+_END_S = 5.0
 _OF_NODE = ("name", "reliable", "latched", "depth", "adapts", "largest_bytes")
 
 
@@ -93,12 +81,11 @@ def _described(topic: NodeTopic, channel: int) -> dict[str, Any]:
 
 
 class RosNode:
-    """The node as a sink of the gateway. It outlives its process, which may be started again.
+    """The node, for the gateway. It outlives its process, which may be started again.
 
     Args:
         command, environment: of the process. The functions are called in a thread that reads its frames.
         on_ready: with the node's full name and its namespace, at each start.
-        on_wanted: when a topic of `offer` gets its first subscriber or loses the last one.
         on_clock: with CLOCK_MONOTONIC, ROS time, nanoseconds, and whether the latter is simulated.
         say: with a line.
     """
@@ -109,20 +96,16 @@ class RosNode:
         environment: Mapping[str, str],
         *,
         on_ready: Callable[[str, str], None],
-        on_wanted: OnWanted,
         on_clock: Callable[[int, int, bool], None],
         say: Callable[[str], None],
     ) -> None:
         self._command, self._environment = command, environment
-        self._on_ready, self._on_wanted, self._on_clock, self._say = on_ready, on_wanted, on_clock, say
+        self._on_ready, self._on_clock, self._say = on_ready, on_clock, say
         self._topics: list[NodeTopic] = []  # the index is the channel
         self._channels: dict[str, int] = {}
-        self._outputs: dict[int, list[tuple[RosTopic, str | None]]] = {}
         self._wanted: set[int] = set()
         self._socket: socket.socket | None = None
         self._lock, self._losses = RLock(), Losses(say)
-        # Held while topics of the bus begin and end, which waits for functions that may need the other lock.
-        self._wanting = Lock()
 
     async def start(self) -> tuple[Process, Callable[[], None]]:
         """Start the process, for `supervised`."""
@@ -161,17 +144,6 @@ class RosNode:
         reading.start()
         return process, end
 
-    def offer(self, topics: Sequence[RosTopic], camera: str | None) -> None:
-        """Publish what is made of topics of the bus while there is a subscriber; a latched one always."""
-        made = [NodeTopic.made_of(topic, camera) for topic in topics]
-        self.declare(*made)
-        for topic, to_publish in zip(topics, made, strict=True):
-            channel = self._channels[to_publish.name]
-            with self._wanting:
-                self._outputs.setdefault(channel, []).append((topic, camera))
-                if topic.latched or channel in self._wanted:
-                    self._on_wanted(topic, camera, True)
-
     def declare(self, *topics: NodeTopic) -> None:
         """Publish topics, or subscribe to them. One that is declared already stays as it is."""
         with self._lock:
@@ -180,10 +152,6 @@ class RosNode:
                 if self._channels.setdefault(topic.name, len(self._topics)) == len(self._topics):
                     self._topics.append(topic)
             self._send_topics(first)
-
-    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
-        """Publish CDR, as the sink of the gateway."""
-        self.send(name, payload)
 
     def send(self, name: str, payload: bytes) -> None:
         """Publish CDR on a declared topic. Without a process it is dropped."""
@@ -233,7 +201,7 @@ class RosNode:
             try:
                 topic.on_serialized(topic.name, topic.type_name, body[protocol.RECEIVED.size :], *stamps)
             except Exception as error:  # no message may end the thread
-                self._losses.add(f"{topic.name}: {error}")
+                self._losses.add(topic.name, f"{topic.name}: message left out: {error}")
         elif kind == protocol.WANTED:
             self._set_wanted(channel, bool(body[0]))
         elif kind == protocol.CLOCK:
@@ -243,11 +211,9 @@ class RosNode:
             self._on_ready(about["name"], about["namespace"].strip("/"))
 
     def _set_wanted(self, channel: int, wanted: bool) -> None:
-        with self._wanting:
-            (self._wanted.add if wanted else self._wanted.discard)(channel)
-            for topic, camera in self._outputs.get(channel, ()):
-                if not topic.latched:
-                    self._on_wanted(topic, camera, wanted)
+        (self._wanted.add if wanted else self._wanted.discard)(channel)
+        if (on_wanted := self._topics[channel].on_wanted) is not None:
+            on_wanted(wanted)
 
 
 def _shut(connection: socket.socket) -> None:
@@ -256,77 +222,55 @@ def _shut(connection: socket.socket) -> None:
 
 
 async def run_node(
-    settings: Settings,
-    python: str,
-    arguments: Sequence[str],
-    ended: asyncio.Event,
-    say: Callable[[str], None],
+    settings: Settings, python: str, arguments: Sequence[str], ending: Event, say: Callable[[str], None]
 ) -> None:
-    """Run the node of a vehicle until `ended` is set. It waits for the service, however late it comes.
+    """Run the node of a vehicle until `ending` is set. It waits for the service, however late it comes.
 
     Raises:
         Ros2Error: ROS refuses the node, for example its name. SourceError: a wrong `ros://` address.
     """
-    section, vehicle = client_settings(settings.zenoh), settings.vehicle.name
-    clock, refused = ServiceClock(section), ""
+    ros2, clock, is_connected, refused = settings.ros2, ServiceClock(), False, ""
     uris = [uri for source in settings.sources().values() for uri in (source.uri, source.depth) if uri]
     cameras = ros_cameras(uris, say, clock.on_frame)
     with ExitStack() as stack:
-        if (session := await _open_session(stack, section, ended, say)) is None:
+        opening = open_patiently(client_settings(settings.zenoh), ending, say)
+        if (session := await asyncio.to_thread(stack.enter_context, opening)) is None:
             return
-        gateway: Gateway | None = None
 
         def on_ready(name: str, namespace: str) -> None:
-            nonlocal gateway
-            if gateway is None:
-                messages = Messages(frame_prefix(namespace), clock.ros_time_ns)
-                gateway = Gateway(session, vehicle, messages, say)
-                node.offer(OUTPUT_TOPICS, None)
-                stack.callback(gateway.close)
-                kept = follow_service(session, vehicle, clock, on_cameras)
-                stack.callback(kept.clear)
+            nonlocal is_connected
+            if not is_connected:  # a remap may have changed the namespace of the settings
+                stack.enter_context(connected(session, settings, namespace, clock, [node], say))
+                is_connected = True
             say(f"node: up: {name}")
-
-        def on_wanted(topic: RosTopic, camera: str | None, wanted: bool) -> None:
-            assert gateway is not None
-            gateway.want(node, topic, camera, wanted)
-
-        def on_cameras(cameras: Sequence[str]) -> None:
-            for camera in set(cameras) - known:
-                known.add(camera)
-                node.offer([topic for topic in OUTPUT_TOPICS if topic.source.of_camera], camera)
 
         def on_end(why: str, again: bool) -> None:
             nonlocal refused
             if not again:
                 refused = why
-                ended.set()
-
-        known: set[str] = set()
-        ros2 = settings.ros2
-        environment = os.environ | ({} if ros2.domain_id is None else {"ROS_DOMAIN_ID": str(ros2.domain_id)})
-        node = RosNode(
-            node_command(python, ros2.node_name, namespace_of(settings), arguments),
-            environment,
-            on_ready=on_ready,
-            on_wanted=on_wanted,
-            on_clock=clock.on_ros_time,
-            say=say,
-        )
-        requests = Requests(
-            session, vehicle, commands=ros2.commands, publish_result=partial(node.send, "~/result"), say=say
-        )
-        node.declare(*requests.topics())
+                ending.set()
 
         def on_image(*message: Any) -> None:
             for camera in cameras:
                 camera.on_serialized(*message)
 
+        environment = os.environ | ({} if ros2.domain_id is None else {"ROS_DOMAIN_ID": str(ros2.domain_id)})
+        node = RosNode(
+            node_command(python, ros2.node_name, namespace_of(settings), arguments),
+            environment,
+            on_ready=on_ready,
+            on_clock=clock.on_ros_time,
+            say=say,
+        )
         images = {topic: kind for camera in cameras for topic, kind in camera.topics.items()}
         node.declare(
             *(
                 NodeTopic(
-                    topic, kind, on_image, False, depth=2, adapts=True, largest_bytes=LARGEST_BINARY_BYTES
+                    *(topic, kind, on_image),
+                    reliable=False,
+                    depth=2,
+                    adapts=True,
+                    largest_bytes=LARGEST_BINARY_BYTES,
                 )
                 for topic, kind in images.items()
             )
@@ -334,23 +278,6 @@ async def run_node(
         for camera in cameras:
             stack.callback(camera.close)
         async with supervised("node", node.start, say, on_end=on_end):
-            await ended.wait()
+            await asyncio.to_thread(ending.wait)
     if refused:
         raise Ros2Error(refused)
-
-
-async def _open_session(
-    stack: ExitStack, section: ZenohSection, ended: asyncio.Event, say: Callable[[str], None]
-) -> zenoh.Session | None:
-    """Wait for the service or its router; None: ended before."""
-    said = False
-    while not ended.is_set():
-        try:
-            return await asyncio.to_thread(stack.enter_context, open_client(section, timeout_s=0.0))
-        except NoAnswerError as error:
-            if not said:
-                say(f"{error}; retrying")
-            said = True
-        with suppress(TimeoutError):
-            await asyncio.wait_for(ended.wait(), _RETRY_S)
-    return None

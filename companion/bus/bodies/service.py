@@ -296,6 +296,8 @@ class StatusBody(TypedDict):
 
     stamp_ns: int
     """of this message"""
+    unix_offset_ns: int
+    """system clock minus CLOCK_MONOTONIC of this host, now: makes Unix time of a stamp"""
     service: str
     """changes at each start; source in pose"""
     uptime_s: float

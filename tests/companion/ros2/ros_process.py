@@ -163,7 +163,7 @@ class BusSide:
             self.session.liveliness().declare_token(alive_key(vehicle)),
             self.session.declare_queryable(command_key(vehicle), self._execute),
         )
-        self.put(STATUS, {"stamp_ns": time.monotonic_ns(), "cameras": {}})
+        self.put_status()
 
     def _execute(self, query: zenoh.Query) -> None:
         assert query.payload is not None
@@ -194,6 +194,10 @@ class BusSide:
         payload = body if isinstance(body, bytes | str) else json.dumps(body)
         about = None if attachment is None else json.dumps(attachment)
         self.publisher(topic, camera).put(payload, attachment=about)
+
+    def put_status(self, *cameras: str, unix_offset_ns: int | None = None) -> None:
+        offset_ns = time.time_ns() - time.monotonic_ns() if unix_offset_ns is None else unix_offset_ns
+        self.put(STATUS, {"unix_offset_ns": offset_ns, "cameras": {camera: {} for camera in cameras}})
 
     def wait_for_reader(self, topic: Topic, wanted: bool = True) -> None:
         """Wait until somebody, or nobody, subscribes to a topic without kept messages."""

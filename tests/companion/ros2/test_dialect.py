@@ -10,6 +10,7 @@ import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from subprocess import PIPE
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from companion.bus import topics
 from companion.bus.client import client_settings, open_client, subscribe_kept
 from companion.bus.topics import DETECTIONS
 from companion.ros2.cdr import decode, encode
@@ -35,7 +37,7 @@ NODE = NodeName(7, "drone1", "companion")
 # rmw_zenoh's docs/design.md.
 STRING_HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
 CHATTER = f"std_msgs::msg::dds_::String_/{STRING_HASH}"
-Wanted = tuple[str, str | None, bool]
+Wanted = tuple[str, bool]
 
 
 def test_keys_and_tokens_are_those_of_the_design_of_rmw_zenoh() -> None:
@@ -79,6 +81,16 @@ def test_attachment_is_33_bytes_little_endian() -> None:
     assert data.hex() == "0100000000000000080706050403020110000102030405060708090a0b0c0d0e0f"
 
 
+class CountingMessages(Messages):
+    converted = 0
+
+    def convert(
+        self, topic: RosTopic, camera: str | None, payload: bytes, attachment: bytes | None = None
+    ) -> bytes | None:
+        self.converted += 1
+        return encode(topic.type_name, {})
+
+
 class Graph:
     """A router, and what one node of ours there wants and says."""
 
@@ -92,15 +104,25 @@ class Graph:
         return open_client(client_settings(ZenohSection(), (self.endpoint,)), timeout_s=WAIT_S)
 
     def node(self, session: zenoh.Session, *, plain: bool = False) -> ZenohNode:
-        now: set[tuple[str, str | None]] = set()
+        return ZenohNode(session, NODE, plain=plain, say=self.said.put)
 
-        def want(_node: object, topic: RosTopic, camera: str | None, wanted: bool) -> None:
-            stream = topic.name, camera
-            if (stream in now) != wanted:  # as the gateway, which accepts repetitions
-                (now.add if wanted else now.discard)(stream)
-                self.wanted.put((*stream, wanted))
+    def topics(self, *topics: RosTopic) -> list[NodeTopic]:
+        now: set[str] = set()
 
-        return ZenohNode(session, NODE, plain=plain, want=want, say=self.said.put)
+        def on_wanted(name: str, wanted: bool) -> None:
+            if (name in now) != wanted:  # as the gateway, which accepts repetitions
+                (now.add if wanted else now.discard)(name)
+                self.wanted.put((name, wanted))
+
+        return [
+            NodeTopic(
+                *(topic.name, topic.type_name),
+                on_wanted=partial(on_wanted, topic.name),
+                latched=topic.latched,
+                depth=1 if topic.latched else 10,
+            )
+            for topic in topics
+        ]
 
     def next_wanted(self) -> Wanted:
         return self.wanted.get(timeout=WAIT_S)
@@ -124,40 +146,49 @@ def until(condition: Callable[[], bool]) -> None:
 def test_topic_is_wanted_while_there_is_a_subscriber(graph: Graph, plain: bool) -> None:
     with graph.session() as ours, graph.session() as others:
         node, labels = graph.node(ours, plain=plain), TOPICS["labels"]
-        node.offer([labels, TOPICS["fix"]], None)
+        node.declare(*graph.topics(labels, TOPICS["fix"]))
         assert graph.wanted.empty()
         key = NODE.plain_key("labels") if plain else NODE.rmw_key("labels", STRING)
         received: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         subscriber = others.declare_subscriber(key, received.put)
-        assert graph.next_wanted() == ("labels", None, True)
-        node.publish("labels", labels, encode(STRING, {"data": "car"}))
+        assert graph.next_wanted() == ("labels", True)
+        node.send("labels", encode(STRING, {"data": "car"}))
         sample = received.get(timeout=WAIT_S)
         assert decode(STRING, sample.payload.to_bytes())["data"] == "car"
         assert sample.encoding == zenoh.Encoding.APPLICATION_CDR
         assert (sample.attachment is None) == plain
         subscriber.undeclare()
-        assert graph.next_wanted() == ("labels", None, False)
+        assert graph.next_wanted() == ("labels", False)
 
 
 def test_cameras_share_the_publisher_of_an_absolute_topic(graph: Graph) -> None:
-    with graph.session() as ours, graph.session() as others:
-        node, tf = graph.node(ours), TOPICS["/tf"]
-        node.offer([tf], None)
+    tf, transforms = TOPICS["/tf"], topics.TRANSFORMS
+    with (
+        graph.session() as service,
+        graph.session() as bus,
+        graph.session() as ours,
+        graph.session() as others,
+    ):
+        gateway = Gateway(bus, "drone1", CountingMessages("", int), [graph.node(ours)], graph.said.put)
+        gateway.offer(None)
         subscriber = others.declare_subscriber(NODE.rmw_key("/tf", tf.type_name), lambda _: None)
-        assert graph.next_wanted() == ("/tf", None, True)
-        node.offer([tf], "down")
-        assert graph.next_wanted() == ("/tf", "down", True)
-        assert len(list(others.liveliness().get("@ros2_lv/7/*/*/*/MP/**"))) == 1
+        first, second = (service.declare_publisher(transforms.key("drone1", name)) for name in (None, "down"))
+        until(lambda: bool(first.matching_status.matching))
+        assert not second.matching_status.matching
+        gateway.offer("down")  # while it is wanted
+        until(lambda: bool(second.matching_status.matching))
+        assert len(list(others.liveliness().get("@ros2_lv/7/*/*/*/MP/*/*/*/%tf/**"))) == 1
         subscriber.undeclare()
-        assert {graph.next_wanted() for _ in range(2)} == {("/tf", None, False), ("/tf", "down", False)}
+        until(lambda: not first.matching_status.matching and not second.matching_status.matching)
+        gateway.close()
 
 
 @pytest.mark.parametrize("plain", [False, True])
 def test_late_subscriber_gets_what_is_latched(graph: Graph, plain: bool) -> None:
     with graph.session() as ours, graph.session() as others:
         node, lens = graph.node(ours, plain=plain), TOPICS["camera_info"]
-        node.offer([lens], None)
-        node.publish("camera_info", lens, encode(lens.type_name, {"width": 640}))
+        node.declare(*graph.topics(lens))
+        node.send("camera_info", encode(lens.type_name, {"width": 640}))
         key = NODE.plain_key("camera_info") if plain else NODE.rmw_key("camera_info", lens.type_name)
         received: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
         subscriber = subscribe_kept(others, key, received.put)
@@ -193,16 +224,6 @@ def test_received_message_that_cannot_be_used_is_reported(graph: Graph) -> None:
             assert received.get(timeout=WAIT_S) == 1.5
 
 
-class CountingMessages(Messages):
-    converted = 0
-
-    def convert(
-        self, topic: RosTopic, camera: str | None, payload: bytes, attachment: bytes | None = None
-    ) -> bytes | None:
-        self.converted += 1
-        return encode(topic.type_name, {})
-
-
 def test_nothing_is_encoded_while_nobody_listens(graph: Graph) -> None:
     topic = TOPICS["detections"]
     with (
@@ -212,9 +233,8 @@ def test_nothing_is_encoded_while_nobody_listens(graph: Graph) -> None:
         graph.session() as others,
     ):
         messages = CountingMessages("", lambda stamp_ns: stamp_ns)
-        gateway = Gateway(bus, "drone1", messages, graph.said.put)
-        node = ZenohNode(ours, NODE, plain=False, want=gateway.want, say=graph.said.put)
-        node.offer(OUTPUT_TOPICS, None)
+        gateway = Gateway(bus, "drone1", messages, [graph.node(ours)], graph.said.put)
+        gateway.offer(None)
         with service.declare_publisher(DETECTIONS.key("drone1")) as publisher:
             received: queue.SimpleQueue[zenoh.Sample] = queue.SimpleQueue()
             subscriber = others.declare_subscriber(NODE.rmw_key("detections", topic.type_name), received.put)
@@ -275,13 +295,13 @@ def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted() -> None:
 
     def publish(node: ZenohNode) -> None:
         until(lambda: graph.wanted.qsize() >= len(OUTPUT_TOPICS))
-        assert {graph.next_wanted()[2] for _ in OUTPUT_TOPICS} == {True}
+        assert {graph.next_wanted()[1] for _ in OUTPUT_TOPICS} == {True}
         for topic in OUTPUT_TOPICS:
-            node.publish(topic.name, topic, encode(topic.type_name, {}))
+            node.send(topic.name, encode(topic.type_name, {}))
 
     with router(graph.port) as process, graph.session() as ours:
         node = graph.node(ours)
-        node.offer(OUTPUT_TOPICS, None)
+        node.declare(*graph.topics(*OUTPUT_TOPICS))
         listed = [(topic.type_name, name) for name, topic in names.items()]
         with receiving(graph.endpoint, NODE.domain_id, listed) as receiver:
             publish(node)
@@ -295,7 +315,7 @@ def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted() -> None:
                 assert token == expected
             process.kill()
             receiver.read_until(lambda seen: not seen.ours())
-            assert {graph.next_wanted()[2] for _ in names} == {False}
+            assert {graph.next_wanted()[1] for _ in names} == {False}
             with router(graph.port):
                 publish(node)
                 receiver.read_until(lambda seen: all(sequence == 2 for sequence, *_ in seen.samples.values()))

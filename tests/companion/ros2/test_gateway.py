@@ -21,23 +21,22 @@ from hypothesis import strategies as st
 
 from companion.bus import topics
 from companion.bus.client import client_settings, open_client
-from companion.bus.topics import LABELS, STATUS, VELOCITY
+from companion.bus.topics import LABELS, VELOCITY
 from companion.guidance.missions.mission_file import plan_from
 from companion.host.peer_data import parse_object
 from companion.ros2 import node as node_file
 from companion.ros2.cdr import decode, encode
-from companion.ros2.gateway import Gateway, ServiceClock, follow_service, namespace_of
-from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_prefix, ros_name, topic_name
+from companion.ros2.gateway import Gateway, NodeTopic, ServiceClock
+from companion.ros2.messages import OUTPUT_TOPICS, Messages, frame_prefix, ros_name, topic_name
 from companion.ros2.process import Ros2Error, find_python
 from companion.ros2.requests import STRING, TWIST, Requests, _mission
+from companion.ros2.wiring import connected, namespace_of
 from companion.settings import Settings, ZenohSection
 from tests.companion.ros2.bus_samples import payload_of
 from tests.companion.ros2.ros_process import VEHICLE, WAIT_S, BusSide, bus
 
 __all__ = ["bus"]
 
-LOOPBACK = ZenohSection(connect=("tcp/127.0.0.1:7447",), mode="client")
-ELSEWHERE = ZenohSection(connect=("tcp/192.168.1.5:7447",), mode="client")
 BY_NAME = {topic.name: topic for topic in OUTPUT_TOPICS}
 
 
@@ -88,28 +87,42 @@ def test_node_file_is_python_3_10_of_the_standard_library_and_rclpy() -> None:
 
 
 def test_stamps_on_this_host_follow_its_system_clock(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = ServiceClock(LOOPBACK)
+    clock = ServiceClock()
     now_ns = time.monotonic_ns()
-    clock.on_status(now_ns)
-    clock.on_run(5)  # of the start of the service: the system clock was set since
+    clock.on_status(time.time_ns() - now_ns)
     assert abs(clock.ros_time_ns(now_ns) - time.time_ns()) < 50_000_000
     unix_ns = time.time_ns
-    monkeypatch.setattr(time, "time_ns", lambda: unix_ns() + 3600 * 10**9)
-    assert clock.ros_time_ns(time.monotonic_ns()) - unix_ns() > 3599 * 10**9
+    monkeypatch.setattr(time, "time_ns", lambda: unix_ns() + 3600 * 10**9)  # it is set
+    stamps = [clock.ros_time_ns(time.monotonic_ns())]
+    clock.on_status(time.time_ns() - time.monotonic_ns())
+    stamps.append(clock.ros_time_ns(time.monotonic_ns()))
+    for stamp in stamps:
+        assert stamp - unix_ns() > 3599 * 10**9
 
 
-@pytest.mark.parametrize(("endpoint", "age_ns"), [(ELSEWHERE, 0), (LOOPBACK, 60 * 10**9)])
-def test_stamps_of_another_host_follow_its_clock(endpoint: ZenohSection, age_ns: int) -> None:
-    clock = ServiceClock(endpoint)
-    clock.on_status(time.monotonic_ns() - age_ns)
-    clock.on_run(7 * 10**15)
+def test_stamps_of_another_host_follow_its_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = ServiceClock()
+    clock.on_status(7 * 10**15)
     assert abs(clock.ros_time_ns(10**9) - (7 * 10**15 + 10**9)) < 1_000_000
+    unix_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: unix_ns() + 3600 * 10**9)  # this host's is set
+    clock.on_status(7 * 10**15)
+    assert abs(clock.ros_time_ns(2 * 10**9) - (7 * 10**15 + 2 * 10**9)) < 1_000_000
+
+
+def test_simulated_stamps_of_another_host_are_those_of_clock_here() -> None:
+    clock = ServiceClock()
+    now_ns = time.monotonic_ns()
+    there_ns = now_ns - 10**15  # its CLOCK_MONOTONIC at this moment
+    clock.on_status(time.time_ns() - there_ns)
+    clock.on_ros_time(now_ns, 50 * 10**9, True)
+    assert abs(clock.ros_time_ns(there_ns) - 50 * 10**9) < 50_000_000
 
 
 def test_stamps_are_of_simulated_time_while_there_is_one_for_the_clock() -> None:
-    clock = ServiceClock(LOOPBACK)
+    clock = ServiceClock()
     now_ns = time.monotonic_ns()
-    clock.on_status(now_ns)
+    clock.on_status(time.time_ns() - time.monotonic_ns())
     clock.on_ros_time(now_ns, 50 * 10**9, True)
     assert clock.ros_time_ns(now_ns - 10**9) == 49 * 10**9
     assert clock.ros_time_ns(now_ns - 60 * 10**9) == 0  # before the simulation began
@@ -117,57 +130,67 @@ def test_stamps_are_of_simulated_time_while_there_is_one_for_the_clock() -> None
     assert abs(clock.ros_time_ns(now_ns) - time.time_ns()) < 10**9
 
 
-class ListSink:
-    """Keeps what is published."""
+class ListNode:
+    """Keeps what is declared and published."""
 
     def __init__(self) -> None:
+        self.topics: dict[str, NodeTopic] = {}
         self.published: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
 
-    def publish(self, name: str, topic: RosTopic, payload: bytes) -> None:
+    def declare(self, *topics: NodeTopic) -> None:
+        self.topics.update((topic.name, topic) for topic in topics)
+
+    def send(self, name: str, payload: bytes) -> None:
         self.published.put((name, payload))
+
+    def want(self, name: str, wanted: bool = True) -> None:
+        on_wanted = self.topics[name].on_wanted
+        assert on_wanted is not None
+        on_wanted(wanted)
 
 
 @pytest.mark.realtime
-def test_bus_is_read_while_any_sink_wants_it(bus: BusSide) -> None:
+def test_bus_is_read_while_any_node_wants_it(bus: BusSide) -> None:
     lines: list[str] = []
-    labels = BY_NAME["labels"]
     with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
-        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), lines.append)
-        first, second = ListSink(), ListSink()
-        for sink in (first, first, second):  # the same again changes nothing
-            gateway.want(sink, labels, None, True)
+        nodes = first, second = ListNode(), ListNode()
+        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), nodes, lines.append)
+        gateway.offer(None)
+        for node in (first, first, second):  # the same again changes nothing
+            node.want("labels")
         bus.wait_for_reader(LABELS)
         bus.put(LABELS, "car")
-        for sink in (first, second):
-            name, payload = sink.published.get(timeout=WAIT_S)
+        for node in nodes:
+            name, payload = node.published.get(timeout=WAIT_S)
             assert (name, decode(STRING, payload)) == ("labels", {"data": "car"})
-        gateway.want(first, labels, None, False)
+        first.want("labels", False)
         bus.put(LABELS, b"\xff")  # not text: said, and the next one is used
         bus.put(LABELS, "boat")
         assert decode(STRING, second.published.get(timeout=WAIT_S)[1]) == {"data": "boat"}
         assert first.published.empty()
         assert len(lines) == 1
-        gateway.want(second, labels, None, False)
+        second.want("labels", False)
         bus.wait_for_reader(LABELS, wanted=False)
         gateway.close()
 
 
 @pytest.mark.realtime
 def test_topic_that_cannot_be_made_keeps_no_other_back(bus: BusSide) -> None:
-    """Of a vehicle without its battery; as the battery is wanted first and by two, it is one loss."""
+    """Of a vehicle without its battery; as the battery is wanted by two, it is one loss."""
     lines: list[str] = []
     body = json.loads(payload_of(topics.VEHICLE)[0])
     del body["battery_fraction"]
     with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
-        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), lines.append)
-        first, second = ListSink(), ListSink()
-        for sink, name in ((first, "battery"), (second, "battery"), (first, "fix"), (first, "pose")):
-            gateway.want(sink, BY_NAME[name], None, True)
+        nodes = first, second = ListNode(), ListNode()
+        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), nodes, lines.append)
+        gateway.offer(None)
+        for node, name in ((second, "battery"), (first, "battery"), (first, "fix"), (first, "pose")):
+            node.want(name)
         bus.wait_for_reader(topics.VEHICLE)
         bus.put(topics.VEHICLE, body)
-        names = [first.published.get(timeout=WAIT_S)[0] for _ in range(2)]
+        names = {first.published.get(timeout=WAIT_S)[0] for _ in range(2)}
         gateway.close()
-    assert names == ["fix", "pose"]
+    assert names == {"fix", "pose"}
     assert second.published.empty()
     assert len(lines) == 1
     assert "BatteryState" in lines[0]
@@ -175,12 +198,12 @@ def test_topic_that_cannot_be_made_keeps_no_other_back(bus: BusSide) -> None:
 
 @pytest.mark.realtime
 def test_cameras_of_the_status_are_followed(bus: BusSide) -> None:
-    cameras: queue.SimpleQueue[list[str]] = queue.SimpleQueue()
-    bus.put(STATUS, {"stamp_ns": time.monotonic_ns(), "cameras": {"down": {}}})
+    bus.put_status("down")
     with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
-        kept = follow_service(session, VEHICLE, ServiceClock(LOOPBACK), cameras.put)
-        assert cameras.get(timeout=WAIT_S) == ["down"]
-        kept.clear()
+        node, vehicle = ListNode(), Settings.model_validate({"vehicle": {"name": VEHICLE}})
+        with connected(session, vehicle, "", ServiceClock(), [node], print):
+            wait_until(lambda: "cameras/down/labels" in node.topics)
+            assert "cameras/down/fix" not in node.topics
 
 
 def test_python_without_rclpy_is_one_line_with_what_to_source(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -332,7 +355,7 @@ def wait_until(fits: Callable[[], object]) -> None:
 
 
 def test_messages_of_one_frame_have_one_stamp() -> None:
-    clock, stamp_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    clock, stamp_ns = ServiceClock(), time.monotonic_ns()
     first = clock.ros_time_ns(stamp_ns)
     for later in range(100):
         clock.ros_time_ns(stamp_ns + later)
@@ -342,7 +365,7 @@ def test_messages_of_one_frame_have_one_stamp() -> None:
 
 
 def test_messages_of_a_frame_of_ros_have_the_stamp_of_its_image() -> None:
-    clock, captured_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    clock, captured_ns = ServiceClock(), time.monotonic_ns()
     computed = clock.ros_time_ns(captured_ns)
     image_ns = computed + 123_457
     clock.on_frame(captured_ns, image_ns)
@@ -350,13 +373,12 @@ def test_messages_of_a_frame_of_ros_have_the_stamp_of_its_image() -> None:
     for later in range(1, 2000):  # other stamps, as those of the vehicle
         clock.ros_time_ns(captured_ns + later)
     clock.on_ros_time(captured_ns, 5 * 10**9, True)
-    clock.on_status(captured_ns - 60 * 10**9)
-    clock.on_run(7 * 10**15)
+    clock.on_status(7 * 10**15)
     assert clock.ros_time_ns(captured_ns) == image_ns
 
 
 def test_stamps_of_images_are_kept_for_the_newest_512() -> None:
-    clock, captured_ns = ServiceClock(LOOPBACK), time.monotonic_ns()
+    clock, captured_ns = ServiceClock(), time.monotonic_ns()
     for index in range(513):
         clock.on_frame(captured_ns + index, index)
     assert clock.ros_time_ns(captured_ns) != 0

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 import pytest
 
-from companion.bus.topics import CAMERA_INFO, DETECTIONS, IMAGE, LABELS, STATUS, VELOCITY
+from companion.bus.topics import CAMERA_INFO, DETECTIONS, IMAGE, LABELS, VELOCITY
 from companion.host.child_process import supervised
 from companion.host.peer_data import parse_object
 from companion.ros2.cdr import encode
@@ -67,7 +67,7 @@ def twist(forward_mps: float = 0.0, left_mps: float = 0.0) -> dict[str, Any]:
 
 @pytest.mark.parametrize("ros", EACH_ROS)
 def test_node_and_its_topics_are_listed_with_their_types(ros: str, bus: BusSide) -> None:
-    bus.put(STATUS, {"stamp_ns": time.monotonic_ns(), "cameras": {"down-left": {}}})
+    bus.put_status("down-left")
     with running_node(ros, bus.endpoint), ros_peer(ros) as peer:
         peer.graph_until(lambda graph: "/drone1/companion" in graph["nodes"])
         graph = peer.graph_until(lambda graph: "/drone1/cameras/down_left/labels" in graph["topics"])
@@ -398,12 +398,19 @@ def test_raw_images_of_900_kb_reach_the_parent_at_30_hz(ros: str, domain: int) -
         node_command(str(ROS_PYTHONS[ros]), "companion", "drone1"),
         os.environ,
         on_ready=lambda _name, _namespace: ready.set(),
-        on_wanted=lambda _topic, _camera, _wanted: None,
         on_clock=lambda _monotonic_ns, _ros_ns, _simulated: None,
         say=print,
     )
     image = "sensor_msgs/msg/Image"
-    node.declare(NodeTopic("camera/image_raw", image, on_serialized, False, False, 2, True, 2**24))
+    node.declare(
+        NodeTopic(
+            *("camera/image_raw", image, on_serialized),
+            reliable=False,
+            depth=2,
+            adapts=True,
+            largest_bytes=2**24,
+        )
+    )
 
     async def until_received() -> None:
         async with supervised("node", node.start, print):
@@ -437,7 +444,6 @@ def test_missing_package_is_named_and_the_rest_works(ros: str, monkeypatch: pyte
         node_command(str(ROS_PYTHONS[ros]), "companion", ""),
         os.environ,
         on_ready=lambda _name, _namespace: ready.set(),
-        on_wanted=lambda _topic, _camera, _wanted: None,
         on_clock=lambda _monotonic_ns, _ros_ns, _simulated: None,
         say=lines.append,
     )
