@@ -20,7 +20,12 @@ from companion.ros2.definitions import full_definition
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, frame_prefix, ros_name, topic_name
 
 # Images are kept as they were encoded.
-_TOPICS = tuple(topic for topic in OUTPUT_TOPICS if topic.type_name != "sensor_msgs/msg/Image")
+_MADE_OF = tuple(
+    (topic, source)
+    for topic in OUTPUT_TOPICS
+    if topic.type_name != "sensor_msgs/msg/Image"
+    for source in topic.sources(None)
+)
 _LARGE = frozenset(topic.name for topic in LARGE_TOPICS)
 
 
@@ -71,11 +76,12 @@ def _converted(reader: RecordingReader, problems: list[str]) -> Iterator[tuple[R
         if channel.startswith("/") != (source in _LARGE):
             continue
         camera = folder.removeprefix("cameras/") or None
-        for topic in _TOPICS:
-            if topic.source.name != source:
+        for topic, made_of in _MADE_OF:
+            if made_of.name != source:
                 continue
             try:
-                data = messages.convert(topic, camera, *_on_the_bus(recorded, source, offset_ns))
+                on_bus = _on_the_bus(recorded, source, offset_ns)
+                data = messages.convert(topic, camera, *on_bus, made_of)
             except (LookupError, TypeError, ValueError) as error:
                 first, times = failed.get(channel, (str(error), 0))
                 failed[channel] = first, times + 1

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import zenoh
 
 from companion.bus.client import message_of, subscribe_kept
-from companion.bus.topics import Topic
+from companion.bus.topics import LARGE_TOPICS, Topic
 from companion.host.clock import unix_offset_ns
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, RosTopic, topic_name
 
@@ -156,7 +156,7 @@ class Gateway:
     ) -> None:
         self._session, self._vehicle, self._messages, self._nodes = session, vehicle, messages, nodes
         # Both are replaced, never changed: zenoh's threads read them without the lock.
-        self._offered: tuple[tuple[str, RosTopic, str | None], ...] = ()  # name in a node; camera
+        self._offered: tuple[tuple[str, RosTopic, Topic, str | None], ...] = ()  # name in a node, …, camera
         self._wanted: frozenset[tuple[Node, str]] = frozenset()
         self._subscribers: dict[str, Any] = {}  # by the path of the bus's topic
         self._lock, self._converting = Lock(), Lock()
@@ -165,9 +165,13 @@ class Gateway:
     def offer(self, camera: str | None) -> None:
         """Publish, while a node wants it, what is made of a further camera; None: everything else."""
         topics = [topic for topic in OUTPUT_TOPICS if camera is None or topic.source.of_camera]
-        offered = [(topic_name(topic, camera), topic, camera) for topic in topics]
+        names = [topic_name(topic, camera) for topic in topics]
         with self._lock:
-            self._offered += tuple(offered)
+            self._offered += tuple(
+                (name, topic, source, camera)
+                for name, topic in zip(names, topics, strict=True)
+                for source in topic.sources(camera)
+            )
         for node in self._nodes:
             node.declare(
                 *(
@@ -179,7 +183,7 @@ class Gateway:
                         latched=topic.latched,
                         depth=1 if topic.latched else 10,
                     )
-                    for name, topic, _ in offered
+                    for name, topic in zip(names, topics, strict=True)
                 )
             )
         self._follow()  # a topic of all cameras may be wanted already
@@ -201,9 +205,9 @@ class Gateway:
         with self._lock:
             names = {name for _, name in self._wanted}
             wanted = {
-                topic.source.path(camera): (topic.source, camera)
-                for name, topic, camera in self._offered
-                if name in names
+                source.path(camera): (source, camera)
+                for name, topic, source, camera in self._offered
+                if name in names and not (source is topic.also and source in LARGE_TOPICS)
             }
             ended = [self._subscribers.pop(path) for path in self._subscribers.keys() - wanted.keys()]
             for path in wanted.keys() - self._subscribers.keys():
@@ -223,12 +227,12 @@ class Gateway:
             return
         made = []
         with self._converting:
-            for name, topic, of_camera in self._offered:
+            for name, topic, made_of, of_camera in self._offered:
                 nodes = [node for node in self._nodes if (node, name) in wanted]
-                if not nodes or topic.source is not source or of_camera != camera:
+                if not nodes or made_of is not source or of_camera != camera:
                     continue
                 try:
-                    cdr = self._messages.convert(topic, camera, payload, attachment)
+                    cdr = self._messages.convert(topic, camera, payload, attachment, source)
                 except ValueError as error:
                     self._losses.add(name, f"{path}: message left out: {error}")
                 else:

@@ -30,11 +30,14 @@ from companion.bus.topics import (
 from companion.host.peer_data import parse_object
 from companion.ros2.cdr import encode
 from vision.attitude import Quaternion, quaternion_product
-from vision.image_file import decode_image
+from vision.image_file import decode_image, stated_size
 
 _Body = dict[str, Any]
 _NAN = math.nan
 _PNG = b"\x89PNG"
+# `camera_info` is that of the images if the newest one is younger; poses on `/tf` come with camera frames if
+# those are. An age has rounding of a millisecond.
+_IMAGED_NS, _POSE_AFTER_NS, _SAME_AGE_NS = 2_000_000_000, 1_000_000_000, 2_000_000
 # sensor_msgs: PointField.FLOAT32, and NavSatStatus.STATUS_UNKNOWN, .STATUS_FIX and .STATUS_NO_FIX.
 _FLOAT32 = 7
 _FIX_STATUS = {None: -2, True: 0, False: -1}
@@ -59,6 +62,7 @@ class RosTopic:
         name: relative to the namespace, of a further camera after `cameras/NAME/`; or absolute, as `/tf`.
         type_name: as `sensor_msgs/msg/Image`.
         source: the topic of the bus that it is made of.
+        also: another one. A large one only while something else needs that.
         latched: the newest message is kept for late subscribers (transient local, depth 1).
         reliable: else best effort.
     """
@@ -66,8 +70,14 @@ class RosTopic:
     name: str
     type_name: str
     source: Topic
+    also: Topic | None = None
     latched: bool = False
     reliable: bool = True
+
+    def sources(self, camera: str | None) -> tuple[Topic, ...]:
+        """Return what it is made of, of the first camera and the vehicle (None), or of a further camera."""
+        made_of = (self.source,) if self.also is None else (self.source, self.also)
+        return tuple(topic for topic in made_of if camera is None or topic.of_camera)
 
 
 OUTPUT_TOPICS: Final = (
@@ -76,9 +86,9 @@ OUTPUT_TOPICS: Final = (
     RosTopic("labels", "std_msgs/msg/String", LABELS),
     RosTopic("image/compressed", "sensor_msgs/msg/CompressedImage", IMAGE),
     RosTopic("image", "sensor_msgs/msg/Image", IMAGE),
-    RosTopic("camera_info", "sensor_msgs/msg/CameraInfo", CAMERA_INFO, latched=True),
+    RosTopic("camera_info", "sensor_msgs/msg/CameraInfo", CAMERA_INFO, IMAGE, latched=True),
     RosTopic("points", "sensor_msgs/msg/PointCloud2", CLOUD),
-    RosTopic("/tf", "tf2_msgs/msg/TFMessage", TRANSFORMS),
+    RosTopic("/tf", "tf2_msgs/msg/TFMessage", TRANSFORMS, VEHICLE),
     RosTopic("fix", "sensor_msgs/msg/NavSatFix", VEHICLE),
     RosTopic("pose", "geometry_msgs/msg/PoseStamped", VEHICLE),
     RosTopic("battery", "sensor_msgs/msg/BatteryState", VEHICLE),
@@ -144,7 +154,7 @@ def _optical_frame(name: str) -> str:
 
 
 class Messages:
-    """Messages of one vehicle's bus as messages of ROS.
+    """Messages of one vehicle's bus as messages of ROS, converted one after the other.
 
     Args:
         frame_prefix: before the name of each frame, such as `drone1/`.
@@ -154,39 +164,50 @@ class Messages:
     def __init__(self, frame_prefix: str, ros_time_ns: Callable[[int], int]) -> None:
         self._prefix = frame_prefix
         self._ros_time_ns = ros_time_ns
-        self._make: dict[str, Callable[[str, _Body, bytes], Mapping[str, Any] | None]] = {
-            "detections": self._detections,
-            "detections_3d": self._detections_3d,
-            "labels": lambda _frame, _body, payload: {"data": payload.decode()},
-            "image/compressed": self._compressed_image,
-            "image": self._image,
-            "camera_info": self._camera_info,
-            "points": self._points,
-            "/tf": self._transforms,
-            "fix": self._fix,
-            "pose": self._pose,
-            "battery": self._battery,
-            "/diagnostics": self._diagnostics,
+        self._lenses: dict[str, _Body] = {}  # newest `camera_info` of a frame
+        self._imaged_ns: dict[str, int] = {}  # newest image of a frame
+        self._pose_due_ns = 0  # stamp from which a pose of the vehicle is sent on `/tf`
+        self._make: dict[tuple[str, str], Callable[[str, _Body, bytes], Mapping[str, Any] | None]] = {
+            ("detections", DETECTIONS.name): self._detections,
+            ("detections_3d", DETECTIONS.name): self._detections_3d,
+            ("labels", LABELS.name): lambda _frame, _body, payload: {"data": payload.decode()},
+            ("image/compressed", IMAGE.name): self._compressed_image,
+            ("image", IMAGE.name): self._image,
+            ("camera_info", CAMERA_INFO.name): self._camera_info,
+            ("camera_info", IMAGE.name): self._camera_info_of_image,
+            ("points", CLOUD.name): self._points,
+            ("/tf", TRANSFORMS.name): self._transforms,
+            ("/tf", VEHICLE.name): self._transform_of_vehicle,
+            ("fix", VEHICLE.name): self._fix,
+            ("pose", VEHICLE.name): self._pose,
+            ("battery", VEHICLE.name): self._battery,
+            ("/diagnostics", STATUS.name): self._diagnostics,
         }
 
     def convert(
-        self, topic: RosTopic, camera: str | None, payload: bytes, attachment: bytes | None = None
+        self,
+        topic: RosTopic,
+        camera: str | None,
+        payload: bytes,
+        attachment: bytes | None = None,
+        source: Topic | None = None,
     ) -> bytes | None:
-        """Return a message of `topic.source` as CDR of `topic`; None: what it is about is not known.
+        """Return a message of the bus as CDR of `topic`; None: what it is about is not known, or was sent.
 
         Args:
+            source: which of `topic.sources` it is of; None: `topic.source`.
             camera: the further camera that it is of; None: the first, or none.
             attachment: of one of `LARGE_TOPICS`.
 
         Raises:
             ValueError: the message is not what its topic says.
         """
-        source, body = topic.source, {}
+        source, body = source or topic.source, {}
         frame = _optical_frame("camera" if camera is None else f"cameras/{camera}")
         try:
             if source != LABELS:
                 body = parse_object((attachment or b"") if source in LARGE_TOPICS else payload)
-            value = self._make[topic.name](frame, body, payload)
+            value = self._make[topic.name, source.name](frame, body, payload)
             return None if value is None else encode(topic.type_name, value)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             raise ValueError(
@@ -249,9 +270,33 @@ class Messages:
         size = {"height": height, "width": width, "encoding": "bgr8", "step": width * channels}
         return {"header": self._header(about["captured_ns"], frame), **size, "data": pixels.tobytes()}
 
-    def _camera_info(self, frame: str, body: _Body, _payload: bytes) -> _Body:
+    def _camera_info(self, frame: str, body: _Body, _payload: bytes) -> _Body | None:
+        """Of unscaled frames, while there are no images."""
+        self._lenses[frame] = body
+        imaged_ns = self._imaged_ns.get(frame)
+        if imaged_ns is not None and body["stamp_ns"] - imaged_ns < _IMAGED_NS:
+            return None
         same = ("height", "width", "distortion_model", "d", "k", "r", "p")
         return {"header": self._header(body["stamp_ns"], frame), **{key: body[key] for key in same}}
+
+    def _camera_info_of_image(self, frame: str, about: _Body, payload: bytes) -> _Body | None:
+        """With stamp and size of the image: its pixels are scaled as `CameraModel.scaled`."""
+        lens, size = self._lenses.get(frame), stated_size(payload)
+        if lens is None or size is None:
+            return None
+        self._imaged_ns[frame] = about["captured_ns"]
+        x, y = size[0] / lens["width"], size[1] / lens["height"]
+        scaling = np.array([[x, 0.0, (x - 1.0) / 2.0], [0.0, y, (y - 1.0) / 2.0], [0.0, 0.0, 1.0]])
+        k, p = (list(map(float, (scaling @ np.reshape(lens[key], (3, -1))).flat)) for key in "kp")
+        same = ("distortion_model", "d", "r")
+        return {
+            "header": self._header(about["captured_ns"], frame),
+            "width": size[0],
+            "height": size[1],
+            "k": k,
+            "p": p,
+            **{key: lens[key] for key in same},
+        }
 
     def _points(self, frame: str, about: _Body, payload: bytes) -> _Body:
         if len(payload) != about["points"] * _POINT_BYTES:
@@ -272,6 +317,7 @@ class Messages:
         }
 
     def _transforms(self, _frame: str, body: _Body, _payload: bytes) -> _Body:
+        self._pose_due_ns = max(self._pose_due_ns, body["captured_ns"] + _POSE_AFTER_NS)
         transforms = []
         for each in body["transforms"]:
             parent, child = _axes_of(each["parent_frame_id"]), _axes_of(each["child_frame_id"])
@@ -286,6 +332,16 @@ class Messages:
             }
             transforms.append(transform)
         return {"transforms": transforms}
+
+    def _transform_of_vehicle(self, frame: str, body: _Body, payload: bytes) -> _Body | None:
+        """The newest pose, each once, where no frame of a camera has brought one for a second."""
+        pose, received_ns = self._pose(frame, body, payload), _received_ns(body, body["position_age_s"])
+        if pose is None or received_ns < self._pose_due_ns:
+            return None
+        self._pose_due_ns = received_ns + _SAME_AGE_NS
+        place = {"translation": pose["pose"]["position"], "rotation": pose["pose"]["orientation"]}
+        child = {"child_frame_id": self._prefix + _BASE.frame, "transform": place}
+        return {"transforms": [{"header": pose["header"], **child}]}
 
     def _fix(self, _frame: str, body: _Body, _payload: bytes) -> _Body | None:
         """The altitude is above mean sea level: the autopilot sends no other."""

@@ -20,7 +20,7 @@ import zenoh
 
 from companion.bus import topics
 from companion.bus.client import client_settings, open_client, subscribe_kept
-from companion.bus.topics import DETECTIONS
+from companion.bus.topics import DETECTIONS, Topic
 from companion.ros2.cdr import decode, encode
 from companion.ros2.dialect import NodeName, ZenohNode, attachment
 from companion.ros2.gateway import Gateway, NodeTopic
@@ -85,7 +85,12 @@ class CountingMessages(Messages):
     converted = 0
 
     def convert(
-        self, topic: RosTopic, camera: str | None, payload: bytes, attachment: bytes | None = None
+        self,
+        topic: RosTopic,
+        camera: str | None,
+        payload: bytes,
+        attachment: bytes | None = None,
+        source: Topic | None = None,
     ) -> bytes | None:
         self.converted += 1
         return encode(topic.type_name, {})

@@ -197,6 +197,27 @@ def test_topic_that_cannot_be_made_keeps_no_other_back(bus: BusSide) -> None:
 
 
 @pytest.mark.realtime
+def test_images_get_camera_info_but_it_alone_needs_no_image(bus: BusSide) -> None:
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        node = ListNode()
+        gateway = Gateway(session, VEHICLE, Messages("", lambda ns: ns), [node], print)
+        gateway.offer(None)
+        node.want("camera_info")
+        bus.put(topics.CAMERA_INFO, json.loads(payload_of(topics.CAMERA_INFO)[0]))
+        assert node.published.get(timeout=WAIT_S)[0] == "camera_info"
+        assert not bus.publisher(topics.IMAGE).matching_status.matching
+        node.want("image/compressed")
+        bus.wait_for_reader(topics.IMAGE)
+        jpeg, about = payload_of(topics.IMAGE)
+        bus.put(topics.IMAGE, jpeg, json.loads(about or b""))
+        made = dict(node.published.get(timeout=WAIT_S) for _ in range(2))
+        image = decode(BY_NAME["image/compressed"].type_name, made["image/compressed"])
+        info = decode(BY_NAME["camera_info"].type_name, made["camera_info"])
+        assert info["header"] == image["header"]
+        gateway.close()
+
+
+@pytest.mark.realtime
 def test_cameras_of_the_status_are_followed(bus: BusSide) -> None:
     bus.put_status("down")
     with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:

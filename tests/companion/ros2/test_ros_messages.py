@@ -47,7 +47,7 @@ from tests.companion.ros2.bus_samples import (
 )
 from tests.companion.ros2.message_readers import equal
 from vision.attitude import quaternion_from_euler
-from vision.camera_model import CameraMount
+from vision.camera_model import CameraModel, CameraMount
 from vision.image_file import decode_image
 from vision.rotation import matrix_from_quaternion
 
@@ -223,6 +223,28 @@ def test_camera_info_is_that_of_the_bus() -> None:
     assert message["header"]["frame_id"] == "drone1/camera_optical"
 
 
+def test_camera_info_of_an_image_has_its_stamp_and_size() -> None:
+    """As image_proc needs it: its rays are those of the whole frame's pixels."""
+    messages, topic = Messages("", abs), BY_NAME["camera_info"]
+    k = [100.0, 0.0, 63.5, 0.0, 110.0, 47.5, 0.0, 0.0, 1.0]
+    p = [90.0, 0.0, 63.5, -9.0, 0.0, 95.0, 47.5, 0.0, 0.0, 0.0, 1.0, 0.0]
+    image = payload_of(IMAGE)
+    assert messages.convert(topic, None, *image, IMAGE) is None  # its lens is not known yet
+    lens = {"width": 128, "height": 96, "k": k, "p": p}
+    assert messages.convert(topic, None, *payload_of(CAMERA_INFO, stamp_ns=CAPTURED_NS - 9, **lens))
+    cdr = messages.convert(topic, None, *image, IMAGE)
+    assert cdr is not None
+    info = decode(topic.type_name, cdr)
+    assert stamp_ns(info["header"]) == CAPTURED_NS
+    assert (info["width"], info["height"]) == PIXELS.shape[1::-1]
+    model = CameraModel(128, 96, 100.0, 110.0, 63.5, 47.5).scaled(64, 48)
+    assert equal(info["k"], [model.fx, 0, model.cx, 0, model.fy, model.cy, 0, 0, 1])
+    assert equal(info["p"], [45, 0, model.cx, -4.5, 0, 47.5, model.cy, 0, 0, 0, 1, 0])
+    for after_s, sent in ((1, False), (3, True)):  # alone again once there are no images
+        again = payload_of(CAMERA_INFO, stamp_ns=CAPTURED_NS + after_s * 10**9, **lens)
+        assert (messages.convert(topic, None, *again) is not None) == sent
+
+
 def test_points_have_places_and_colours() -> None:
     message = of("points")
     formats = {7: "<f4"}
@@ -275,6 +297,28 @@ def test_transforms_lead_from_the_camera_to_enu(mount: CameraMount, children: li
         ENU_FROM_NED @ matrix_from_quaternion(STATE.attitude or (1, 0, 0, 0)) @ FLU_FROM_FRD,
         atol=1e-5,
     )
+
+
+def test_pose_is_on_tf_where_no_camera_has_brought_one() -> None:
+    messages, topic = Messages("drone1/", abs), BY_NAME["/tf"]
+
+    def sent(position_ns: int) -> Any:
+        body = vehicle_message(replace(STATE, position_ns=position_ns), position_ns + 40_000_000)
+        cdr = messages.convert(topic, None, json.dumps(body).encode(), None, VEHICLE)
+        return None if cdr is None else decode(topic.type_name, cdr)["transforms"][0]
+
+    first = sent(CAPTURED_NS)
+    assert (first["header"]["frame_id"], first["child_frame_id"]) == ("drone1/map", "drone1/base_link")
+    assert stamp_ns(first["header"]) == CAPTURED_NS
+    assert xyz(first["transform"]["translation"]) == [2.0, 1.0, 3.0]
+    assert sent(CAPTURED_NS) is None  # each pose once
+    assert sent(CAPTURED_NS + 10**8)
+    history = StateHistory()
+    history.add(replace(STATE, position_ns=CAPTURED_NS))
+    frame = transforms_message(7, CAPTURED_NS, CameraMount(), history, "v-1")
+    assert messages.convert(topic, None, json.dumps(frame).encode())
+    assert [bool(sent(CAPTURED_NS + index * 5 * 10**8)) for index in (1, 2, 3)] == [False, True, True]
+    assert sent(CAPTURED_NS + 10**8) is None
 
 
 @given(UNIT)
