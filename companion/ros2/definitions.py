@@ -32,6 +32,7 @@ _FIELDS = {
         "Transform": "Vector3 translation; Quaternion rotation",
         "TransformStamped": "std_msgs/Header header; string child_frame_id; Transform transform",
         "Twist": "Vector3 linear; Vector3 angular",
+        "TwistStamped": "std_msgs/Header header; Twist twist",
         "Vector3": "float64 x; float64 y; float64 z",
     },
     "sensor_msgs": {

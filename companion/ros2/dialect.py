@@ -14,7 +14,7 @@ import hashlib
 import struct
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from threading import Lock
@@ -138,6 +138,8 @@ class ZenohNode:
         for topic in topics:
             if topic.name in self._publishers:
                 continue
+            if topic.other_type is not None and not self._plain:  # a plain key has no type
+                self.declare(replace(topic, type_name=topic.other_type, other_type=None))
             key, gid = self._name.plain_key(topic.name), None
             if not self._plain:
                 key = self._name.rmw_key(topic.name, topic.type_name)
@@ -171,7 +173,12 @@ class ZenohNode:
         assert topic.on_serialized is not None
         try:
             payload = memoryview(copy_payload(sample.payload, LARGEST_JSON_BYTES))
-            topic.on_serialized(topic.name, topic.type_name, payload, time.monotonic_ns(), time.time_ns())
+            now_ns, about = time.time_ns(), sample.attachment
+            sent_ns = (
+                now_ns if about is None else _ATTACHMENT.unpack(copy_payload(about, _ATTACHMENT.size))[1]
+            )
+            stamps = time.monotonic_ns(), now_ns, now_ns - sent_ns
+            topic.on_serialized(topic.name, topic.type_name, payload, *stamps)
         except Exception as error:  # no message may end the thread
             self._losses.add(topic.name, f"{topic.name}: message left out: {error}")
 

@@ -23,10 +23,11 @@ LARGEST_REQUEST_BYTES = 64 * 1024
 _STAMPS_KEPT = 512  # of some seconds: images come after their detections
 _SAME_CLOCK_NS = 1_000_000  # two readings of one pair of clocks differ by less
 
-OnSerialized = Callable[[str, str, memoryview, int, int], None]
-"""(topic name, type name, CDR, received_ns, ros_now_ns): a message that a node received.
+OnSerialized = Callable[[str, str, memoryview, int, int, int], None]
+"""(topic name, type name, CDR, received_ns, ros_now_ns, age_ns): a message that a node received.
 
-CDR is valid during the call only. `received_ns` is CLOCK_MONOTONIC, `ros_now_ns` ROS time of the same moment.
+CDR is valid during the call only. `received_ns` is CLOCK_MONOTONIC, `ros_now_ns` ROS time of the same moment,
+`age_ns` the time since it was sent, by the system clocks of both computers; 0: not known.
 """
 
 
@@ -42,6 +43,7 @@ class NodeTopic:
         adapts: this subscription becomes reliable where all publishers are: large images need it. A velocity
             must not: after a gap of the network old ones would be sent again.
         largest_bytes: a larger message that is received is left out, before it is copied.
+        other_type: is received too. A topic of DDS has one type in a program: that of its publishers is used.
     """
 
     name: str
@@ -53,6 +55,7 @@ class NodeTopic:
     depth: int = 10
     adapts: bool = False
     largest_bytes: int = LARGEST_REQUEST_BYTES
+    other_type: str | None = None
 
 
 class ServiceClock:

@@ -93,7 +93,13 @@ class RosCamera:
         self._lock = Lock()
 
     def on_serialized(
-        self, topic: str, type_name: str, payload: bytes | memoryview, received_ns: int, ros_now_ns: int
+        self,
+        topic: str,
+        type_name: str,
+        payload: bytes | memoryview,
+        received_ns: int,
+        ros_now_ns: int,
+        _age_ns: int = 0,
     ) -> None:
         """Process a message; those of other topics are ignored.
 

@@ -28,8 +28,9 @@ import time
 from typing import Any
 
 FRAME = struct.Struct("<BxHI")  # kind, channel, bytes of the body
-RECEIVED = struct.Struct("<qq")  # when: CLOCK_MONOTONIC and ROS time, nanoseconds
-CLOCK_BODY = struct.Struct("<qq?")  # as `RECEIVED`, and whether ROS time is simulated
+# Which of the topic's types; when: CLOCK_MONOTONIC, ROS time; time since it was sent, or 0; nanoseconds.
+RECEIVED = struct.Struct("<Bqqq")
+CLOCK_BODY = struct.Struct("<qq?")  # CLOCK_MONOTONIC and ROS time of a moment, and whether that is simulated
 TOPICS, MESSAGE, WANTED, READY, CLOCK = range(1, 6)
 EXIT_REFUSED = 2  # it has printed why it cannot work
 _PERIOD_S = 0.2
@@ -47,7 +48,7 @@ class _Bridge:
     def __init__(self, node: Any, parent: socket.socket, namesake_s: float) -> None:
         self._node, self._parent, self._lock = node, parent, threading.Lock()
         self._publishers: dict[int, Any] = {}
-        self._adapted: dict[int, tuple[dict[str, Any], Any]] = {}  # topic and subscription
+        self._adapted: dict[int, tuple[dict[str, Any], Any]] = {}  # topic and subscription, None: due
         self._large: dict[str, float] = {}  # topic and when its last message that is too large was reported
         self._wanted: set[int] = set()
         self._namesake_checks = int(namesake_s / _PERIOD_S)
@@ -82,7 +83,7 @@ class _Bridge:
                 self.send(WANTED, channel, bytes([wanted]))
         self.send(CLOCK, 0, CLOCK_BODY.pack(*self._now(), self._node.get_clock().ros_time_is_active))
         self._check_name()
-        self._adapt_reliability()
+        self._adapt()
 
     def _now(self) -> tuple[int, int]:
         """CLOCK_MONOTONIC and ROS time of the same moment: a busy computer pauses between two readings."""
@@ -94,16 +95,27 @@ class _Bridge:
                 break
         return after_ns, ros_ns
 
-    def _adapt_reliability(self) -> None:
-        """Subscribe reliably while all publishers are reliable: of large images most are lost without."""
+    def _adapt(self) -> None:
+        """Subscribe as the publishers allow: with their type; reliably if all are, where a topic adapts.
+
+        Of large images most are lost without. A subscription of another type is created at the next call: the
+        executor may still hold the one before, and both cannot exist.
+        """
         from rclpy.qos import ReliabilityPolicy
 
-        for topic, subscription in list(self._adapted.values()):
+        for channel, (topic, subscription) in list(self._adapted.items()):
+            if subscription is None:
+                self._add([topic])
+                continue
             offered = self._node.get_publishers_info_by_topic(topic["name"])
-            reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
-            if offered and reliable != topic["reliable"]:
+            types = [name for name in topic["types"] if name in {p.topic_type for p in offered}]
+            kind = topic["type"] if topic["type"] in types or not types else types[0]
+            reliable = topic["reliable"]
+            if topic["adapts"] and offered:
+                reliable = all(p.qos_profile.reliability == ReliabilityPolicy.RELIABLE for p in offered)
+            if (kind, reliable) != (topic["type"], topic["reliable"]):
                 self._node.destroy_subscription(subscription)
-                self._add([{**topic, "reliable": reliable}])
+                self._adapted[channel] = {**topic, "type": kind, "reliable": reliable}, None
 
     def _check_name(self) -> None:
         name = self._node.get_name(), self._node.get_namespace()
@@ -122,13 +134,14 @@ class _Bridge:
     def _add(self, topics: list[dict[str, Any]]) -> None:
         missing: dict[str, list[str]] = {}
         for topic in topics:
-            package = topic["type"].partition("/")[0]
+            kind = topic.setdefault("type", topic["types"][0])
+            package = kind.partition("/")[0]
             try:
                 self._create(topic, importlib.import_module(package + ".msg"))
             except ModuleNotFoundError:
                 missing.setdefault(package, []).append(topic["name"])
             except Exception as error:
-                _say(f"{topic['name']} is left out: {topic['type']}: {_first_line(error)}")
+                _say(f"{topic['name']} is left out: {kind}: {_first_line(error)}")
         for package, names in missing.items():
             apt = f"ros-{os.environ.get('ROS_DISTRO', 'DISTRO')}-{package.replace('_', '-')}"
             _say(f"{package} is not installed (sudo apt install {apt}): left out: {', '.join(names)}")
@@ -144,17 +157,20 @@ class _Bridge:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if topic["latched"] else DurabilityPolicy.VOLATILE,
         )
 
-        def receive(payload: bytes) -> None:
+        def receive(payload: bytes, info: dict[str, int]) -> None:
             if len(payload) > topic["largest_bytes"]:
                 self._leave_out(name, len(payload), topic["largest_bytes"])
                 return
-            self.send(MESSAGE, channel, RECEIVED.pack(*self._now()), payload)
+            sent_ns = info.get("source_timestamp", 0)
+            age_ns = time.time_ns() - sent_ns if sent_ns > 0 else 0
+            number = topic["types"].index(topic["type"])
+            self.send(MESSAGE, channel, RECEIVED.pack(number, *self._now(), age_ns), payload)
 
         if topic["publish"]:
             self._publishers[channel] = self._node.create_publisher(kind, name, profile)
             return
         subscription = self._node.create_subscription(kind, name, receive, profile, raw=True)
-        if topic["adapts"]:
+        if topic["adapts"] or len(topic["types"]) > 1:
             self._adapted[channel] = topic, subscription
 
 

@@ -31,7 +31,7 @@ SILENT_S = 10.0
 _PROBE_S = 30.0
 # One that was killed is listed by the others for up to 20 s (the lease of DDS).
 NAMESAKE_S = 25.0
-_END_S = 5.0
+_END_S, _ENDS_ITSELF_S = 5.0, 1.0
 _OF_NODE = ("name", "reliable", "latched", "depth", "adapts", "largest_bytes")
 
 
@@ -77,7 +77,11 @@ def node_command(python: str, name: str, namespace: str, arguments: Sequence[str
 def _described(topic: NodeTopic, channel: int) -> dict[str, Any]:
     """Return what the node reads of a topic."""
     about = {name: getattr(topic, name) for name in _OF_NODE}
-    return {**about, "channel": channel, "type": topic.type_name, "publish": topic.on_serialized is None}
+    return {**about, "channel": channel, "types": _types(topic), "publish": topic.on_serialized is None}
+
+
+def _types(topic: NodeTopic) -> list[str]:
+    return [topic.type_name, *([] if topic.other_type is None else [topic.other_type])]
 
 
 class RosNode:
@@ -131,8 +135,8 @@ class RosNode:
 
         def read() -> None:
             self._read(ours)
-            if not ended:  # it has gone, or is stuck
-                loop.call_soon_threadsafe(kill)
+            if not ended:  # it is stuck, or ends now: then a signal could take its exit code from the watcher
+                loop.call_soon_threadsafe(loop.call_later, _ENDS_ITSELF_S, kill)
 
         def end() -> None:
             nonlocal ended
@@ -196,10 +200,10 @@ class RosNode:
 
     def _on_frame(self, kind: int, channel: int, body: memoryview) -> None:
         if kind == protocol.MESSAGE:
-            topic, stamps = self._topics[channel], protocol.RECEIVED.unpack_from(body)
+            topic, (kind, *stamps) = self._topics[channel], protocol.RECEIVED.unpack_from(body)
             assert topic.on_serialized is not None
             try:
-                topic.on_serialized(topic.name, topic.type_name, body[protocol.RECEIVED.size :], *stamps)
+                topic.on_serialized(topic.name, _types(topic)[kind], body[protocol.RECEIVED.size :], *stamps)
             except Exception as error:  # no message may end the thread
                 self._losses.add(topic.name, f"{topic.name}: message left out: {error}")
         elif kind == protocol.WANTED:

@@ -21,6 +21,8 @@ from companion.ros2.cdr import decode, encode
 from companion.ros2.gateway import NodeTopic
 
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+_OLDEST_NS = 500_000_000  # of a velocity, as on the bus
 _CLASS_NAME = re.compile(r'[^"\\\x00-\x1f]{1,64}')
 _JUST_STARTED_NS, _REPETITION_NS = 5_000_000_000, 10_000_000_000
 _AGAIN = "the same text within 10 s is no new command; publish it --once"
@@ -77,15 +79,32 @@ class Requests:
         """Return what a node subscribes to, and the topic of the outcomes."""
         return (
             NodeTopic("~/result", STRING),
-            NodeTopic("cmd_vel", TWIST, self.on_velocity, reliable=False, depth=1),
+            NodeTopic("cmd_vel", TWIST, self.on_velocity, reliable=False, depth=1, other_type=TWIST_STAMPED),
             NodeTopic("object_to_seek", STRING, self.on_object),
             NodeTopic("~/command", STRING, self.on_command),
         )
 
-    def on_velocity(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
-        """Process a Twist: metres and radians per second, FLU. Raises ValueError: it is not used."""
-        twist = decode(type_name, payload)
+    def on_velocity(
+        self, name: str, type_name: str, payload: memoryview, received_ns: int, ros_now_ns: int, age_ns: int
+    ) -> None:
+        """Process a Twist or TwistStamped: metres and radians per second, FLU.
+
+        One that waited in a program that stood still, or in the network, must not steer.
+
+        Raises:
+            ValueError: it is not used.
+        """
+        message = decode(type_name, payload)
+        twist = message.get("twist", message)
         linear, angular = twist["linear"], twist["angular"]
+        stamp = message["header"]["stamp"] if type_name == TWIST_STAMPED else {"sec": 0, "nanosec": 0}
+        if (stamp_ns := stamp["sec"] * 1_000_000_000 + stamp["nanosec"]) != 0:
+            age_ns = max(age_ns, ros_now_ns - stamp_ns)
+        age_ns += time.monotonic_ns() - received_ns
+        if age_ns > _OLDEST_NS:
+            raise ValueError(
+                f"is {age_ns / 1e9:.1f} s old: do both computers have the same time? (use_sim_time)"
+            )
         if not all(map(math.isfinite, (*linear.values(), *angular.values()))):
             raise ValueError("a velocity is not a finite number")
         body = {
@@ -98,7 +117,7 @@ class Requests:
         }
         self._velocities.put(json.dumps(body))
 
-    def on_object(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+    def on_object(self, name: str, type_name: str, payload: memoryview, received_ns: int, *_: int) -> None:
         """Process the name of a class: `seek` it, then `approach` it, as one mission, which the pilot ends.
 
         A publisher may repeat it without end, also after the pilot or another command has ended the flight,
@@ -119,7 +138,7 @@ class Requests:
         elif idle:
             self._answer(wanted, {"success": False, "reason": f"{name}: {_REPEATED}"})
 
-    def on_command(self, name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+    def on_command(self, name: str, type_name: str, payload: memoryview, received_ns: int, *_: int) -> None:
         """Process a command of the grammar.
 
         `ros2 topic pub` repeats a message at 1 Hz unless it is given `--once`. So the same text less than

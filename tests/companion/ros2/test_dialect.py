@@ -215,7 +215,7 @@ def test_received_message_that_cannot_be_used_is_reported(graph: Graph) -> None:
     with graph.session() as ours, graph.session() as others:
         received: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
-        def on_twist(name: str, type_name: str, payload: memoryview, received_ns: int, _: int) -> None:
+        def on_twist(name: str, type_name: str, payload: memoryview, received_ns: int, *_: int) -> None:
             received.put(decode(type_name, payload)["linear"]["x"])
             assert 0 <= time.monotonic_ns() - received_ns < 1e9
 

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 import tomllib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ from companion.ros2.cdr import decode, encode
 from companion.ros2.gateway import Gateway, NodeTopic, ServiceClock
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, frame_prefix, ros_name, topic_name
 from companion.ros2.process import Ros2Error, find_python
-from companion.ros2.requests import STRING, TWIST, Requests, _mission
+from companion.ros2.requests import STRING, TWIST, TWIST_STAMPED, Requests, _mission
 from companion.ros2.wiring import connected, namespace_of
 from companion.settings import Settings, ZenohSection
 from tests.companion.ros2.bus_samples import payload_of
@@ -348,24 +348,62 @@ def test_same_object_again_changes_nothing_a_new_one_replaces_it(bus: BusSide, r
     assert ["boat" in command for command in sorted(commands)] == [True, False]
 
 
-@pytest.mark.realtime
-@pytest.mark.parametrize("number", [float("nan"), float("inf")])
-@pytest.mark.parametrize("part", ["linear", "angular"])
-def test_twist_that_is_not_finite_is_not_sent(number: float, part: str, bus: BusSide, requests: Any) -> None:
-    made, _ = requests
+@pytest.fixture
+def velocities(bus: BusSide, requests: Any) -> Iterator[queue.SimpleQueue[dict[str, Any]]]:
     received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
     subscriber = bus.session.declare_subscriber(
         VELOCITY.key(VEHICLE), lambda sample: received.put(parse_object(sample.payload.to_bytes()))
     )
-    wait_until(lambda: made._velocities.matching_status.matching)
-    with pytest.raises(ValueError, match="finite"):
-        made.on_velocity("cmd_vel", TWIST, memoryview(encode(TWIST, {part: {"x": number}})), 1, 1)
-    right = memoryview(encode(TWIST, {"linear": {"x": 1.0, "y": 0.5}, "angular": {"z": -0.2}}))
-    made.on_velocity("cmd_vel", TWIST, right, 2, 2)
-    velocity = received.get(timeout=WAIT_S)
+    wait_until(lambda: requests[0]._velocities.matching_status.matching)
+    yield received
     subscriber.undeclare()  # type: ignore[no-untyped-call]
-    assert (velocity["stamp_ns"], velocity["forward_mps"], velocity["right_mps"]) == (2, 1.0, -0.5)
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("number", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["linear", "angular"])
+def test_twist_that_is_not_finite_is_not_sent(
+    number: float, part: str, velocities: Any, requests: Any
+) -> None:
+    made, now_ns = requests[0], time.monotonic_ns()
+    with pytest.raises(ValueError, match="finite"):
+        made.on_velocity("cmd_vel", TWIST, memoryview(encode(TWIST, {part: {"x": number}})), now_ns, 1, 0)
+    right = memoryview(encode(TWIST, {"linear": {"x": 1.0, "y": 0.5}, "angular": {"z": -0.2}}))
+    made.on_velocity("cmd_vel", TWIST, right, now_ns, 2, 0)
+    velocity = velocities.get(timeout=WAIT_S)
+    assert (velocity["stamp_ns"], velocity["forward_mps"], velocity["right_mps"]) == (now_ns, 1.0, -0.5)
     assert velocity["turn_radps"] == 0.2
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize(
+    ("kind", "stamp_s", "late_s", "age_s", "used"),
+    [
+        (TWIST, 0, 0.0, 0.0, True),  # of a publisher without a clock
+        (TWIST, 0, 0.0, 0.3, True),
+        (TWIST, 0, 0.0, -7.0, True),  # its clock is ahead
+        (TWIST, 0, 0.0, 0.6, False),
+        (TWIST, 0, 0.6, 0.0, False),  # waited for us
+        (TWIST_STAMPED, 0, 0.0, 0.0, True),
+        (TWIST_STAMPED, 50, 0.0, 0.0, True),
+        (TWIST_STAMPED, 49, 0.0, 0.0, False),
+        (TWIST_STAMPED, 0, 0.0, 0.6, False),
+    ],
+)
+def test_velocity_older_than_half_a_second_is_not_sent(
+    kind: str, stamp_s: int, late_s: float, age_s: float, used: bool, velocities: Any, requests: Any
+) -> None:
+    linear = {"linear": {"x": 1.0}}
+    stamped = {"header": {"stamp": {"sec": stamp_s}}, "twist": linear}
+    payload = memoryview(encode(kind, stamped if kind == TWIST_STAMPED else linear))
+    received_ns = time.monotonic_ns() - round(late_s * 1e9)
+    arguments = "cmd_vel", kind, payload, received_ns, 50 * 10**9, round(age_s * 1e9)
+    if used:
+        requests[0].on_velocity(*arguments)
+        assert velocities.get(timeout=WAIT_S)["forward_mps"] == 1.0
+    else:
+        with pytest.raises(ValueError, match="old"):
+            requests[0].on_velocity(*arguments)
 
 
 def wait_until(fits: Callable[[], object]) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import json
 import os
+import queue
 import signal
 import threading
 import time
@@ -43,6 +44,7 @@ __all__ = ["bus", "domain"]
 pytestmark = [pytest.mark.realtime, pytest.mark.usefixtures("domain")]
 JAZZY = EACH_ROS[:1]
 STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 LENS = {
     "stamp_ns": 0,
     "frame_id": "drone1/camera",
@@ -223,6 +225,49 @@ def test_twist_becomes_a_velocity_and_nan_is_left_out(ros: str, bus: BusSide) ->
     assert [velocity[name] for name in names] == [1.0, -2.0, 3.0, -0.5]
 
 
+@pytest.mark.parametrize("ros", EACH_ROS)
+def test_velocity_has_the_type_of_its_publishers(ros: str, bus: BusSide) -> None:
+    received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    subscriber = bus.session.declare_subscriber(
+        VELOCITY.key(VEHICLE), lambda sample: received.put(parse_object(sample.payload.to_bytes()))
+    )
+    with running_node(ros, bus.endpoint) as node:
+        for speed_mps, kind in ((1.0, TWIST_STAMPED), (2.0, TWIST)):
+            message = twist(speed_mps) if kind == TWIST else {"twist": twist(speed_mps)}
+            with ros_peer(ros) as peer:
+                peer.publish("/drone1/cmd_vel", kind, message, times=1000, hz=20)
+                while received.get(timeout=WAIT_S)["forward_mps"] != speed_mps:
+                    pass
+        node.last_lines()
+        assert not any("left out" in line for line in node.lines)
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
+
+
+@pytest.mark.parametrize("ros", JAZZY)
+def test_velocity_that_waited_in_a_stopped_node_is_left_out(ros: str, bus: BusSide) -> None:
+    received: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+    subscriber = bus.session.declare_subscriber(
+        VELOCITY.key(VEHICLE), lambda sample: received.put(parse_object(sample.payload.to_bytes()))
+    )
+    with running_node(ros, bus.endpoint) as node, ros_peer(ros) as peer:
+        peer.publish("/drone1/cmd_vel", TWIST, twist(1.0), times=10, hz=20)
+        peer.wait_for(lambda line: "published" in line)
+        received.get(timeout=WAIT_S)
+        os.kill(process_of_node(node), signal.SIGSTOP)
+        try:
+            peer.publish("/drone1/cmd_vel", TWIST, twist(5.0), times=3, hz=20)  # Fast DDS keeps them for 1 s
+            peer.wait_for(lambda line: "published" in line)
+            time.sleep(0.6)  # they become old
+        finally:
+            os.kill(process_of_node(node), signal.SIGCONT)
+        peer.publish("/drone1/cmd_vel", TWIST, twist(2.0), times=10, hz=20)
+        speeds_mps = []
+        while 2.0 not in speeds_mps:
+            speeds_mps.append(received.get(timeout=WAIT_S)["forward_mps"])
+    subscriber.undeclare()  # type: ignore[no-untyped-call]
+    assert set(speeds_mps) == {1.0, 2.0}
+
+
 @pytest.mark.parametrize("ros", JAZZY)
 def test_command_of_100_kb_is_left_out_with_its_size(ros: str, bus: BusSide) -> None:
     with running_node(ros, bus.endpoint) as node, ros_peer(ros) as peer:
@@ -390,7 +435,10 @@ def test_300_of_300_detections_arrive_with_every_field(ros: str, bus: BusSide) -
 def test_raw_images_of_900_kb_reach_the_parent_at_30_hz(ros: str, domain: int) -> None:
     received: list[tuple[str, str, int, int, int]] = []
 
-    def on_serialized(name: str, kind: str, payload: memoryview, received_ns: int, ros_ns: int) -> None:
+    def on_serialized(
+        name: str, kind: str, payload: memoryview, received_ns: int, ros_ns: int, age_ns: int
+    ) -> None:
+        assert 0 < age_ns < WAIT_S * 1e9
         received.append((name, kind, len(payload), received_ns, ros_ns))
 
     ready = threading.Event()
