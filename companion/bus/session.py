@@ -34,6 +34,7 @@ from companion.bus.topics import (
     VIEW_TOPICS,
     Topic,
     alive_key,
+    client_key,
     command_key,
 )
 from companion.host.peer_data import Payload, copy_payload
@@ -59,6 +60,7 @@ _MISS_HEARTBEAT_S = 1.0
 # Larger messages are sent in fragments of zenoh's batch of 64 KiB.
 LARGE_BYTES = 48_000
 _MOST_UNSENT = 1000
+_LONGEST_NAME = 64  # of a client
 # Minimum interval of logged command failures.
 _LOG_PERIOD_S = 1.0
 
@@ -77,7 +79,8 @@ class Bus:
     """One vehicle's publications and its queryables.
 
     Args:
-        on_event: called with (level, text) when the network is lost or found.
+        on_event: called with (level, text) when the network is lost or found, or a client with a token
+            (`client_key`) has gone.
         on_command: returns a command's JSON-able reply; called in the loop, one task each.
         queries: path of a queryable → function that returns its reply, a body or a JPEG; called as
             `on_command`. A TimeoutError or KeyError is replied as an error.
@@ -316,6 +319,8 @@ class Bus:
             session.declare_queryable(f"{ROOT}/{self._vehicle}/{path}", partial(self._on_query, path))
             for path in self._queries
         ]
+        clients = client_key(self._vehicle, "*")
+        self._subscribers = [session.liveliness().declare_subscriber(clients, self._on_client)]
         for listener in self.listeners:
             queue = ListenerQueue(listener, self._call_soon, self._on_event)
             self._received.append(queue)
@@ -369,6 +374,11 @@ class Bus:
         if self._loop is not None:
             with suppress(RuntimeError):  # the loop is closed
                 self._loop.call_soon_threadsafe(call, *arguments)
+
+    def _on_client(self, sample: zenoh.Sample) -> None:
+        if sample.kind == zenoh.SampleKind.DELETE and self._query_allowance.take():
+            name = str(sample.key_expr).rpartition("/")[2][:_LONGEST_NAME]
+            self._call_soon(self._on_event, "warning", f"{name} has gone: it has ended, or was cut off")
 
     @staticmethod
     def _on_sample(queue: ListenerQueue, sample: zenoh.Sample) -> None:

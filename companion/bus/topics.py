@@ -339,6 +339,11 @@ def command_key(vehicle: str) -> str:
     return f"{ROOT}/{vehicle}/{COMMAND}"
 
 
+def client_key(vehicle: str, name: str) -> str:
+    """Return the key of a client's liveliness token: the service makes an event of its end."""
+    return f"{ROOT}/{vehicle}/clients/{name}"
+
+
 def alive_key(vehicle: str) -> str:
     """Return the key of one service's liveliness token; zenoh removes the token when the service ends."""
     return f"{ROOT}/{vehicle}/alive"

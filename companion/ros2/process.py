@@ -16,9 +16,11 @@ from pathlib import Path
 from threading import Event, RLock, Thread
 from typing import Any
 
+import zenoh
+
 from companion.bus.child_client import open_patiently
 from companion.bus.client import client_settings
-from companion.bus.topics import LARGEST_BINARY_BYTES
+from companion.bus.topics import LARGEST_BINARY_BYTES, client_key
 from companion.host.child_process import supervised
 from companion.ros2 import node as protocol
 from companion.ros2.gateway import Losses, NodeTopic, ServiceClock
@@ -31,6 +33,7 @@ SILENT_S = 10.0
 _PROBE_S = 30.0
 # One that was killed is listed by the others for up to 20 s (the lease of DDS).
 NAMESAKE_S = 25.0
+_CLIENT = "ros2-node"
 _END_S, _ENDS_ITSELF_S = 5.0, 1.0
 _OF_NODE = ("name", "reliable", "latched", "depth", "adapts", "largest_bytes")
 
@@ -234,6 +237,7 @@ async def run_node(
         Ros2Error: ROS refuses the node, for example its name. SourceError: a wrong `ros://` address.
     """
     ros2, clock, is_connected, refused = settings.ros2, ServiceClock(), False, ""
+    token: zenoh.LivelinessToken | None = None
     uris = [uri for source in settings.sources().values() for uri in (source.uri, source.depth) if uri]
     cameras = ros_cameras(uris, say, clock.on_frame)
     with ExitStack() as stack:
@@ -242,14 +246,16 @@ async def run_node(
             return
 
         def on_ready(name: str, namespace: str) -> None:
-            nonlocal is_connected
+            nonlocal is_connected, token
+            token = session.liveliness().declare_token(client_key(settings.vehicle.name, _CLIENT))
             if not is_connected:  # a remap may have changed the namespace of the settings
                 stack.enter_context(connected(session, settings, namespace, clock, [node], say))
                 is_connected = True
             say(f"node: up: {name}")
 
         def on_end(why: str, again: bool) -> None:
-            nonlocal refused
+            nonlocal refused, token
+            token = None  # undeclares it
             if not again:
                 refused = why
                 ending.set()

@@ -52,7 +52,8 @@ class OpenBus:
 
     async def __aenter__(self) -> OpenBus:
         await self.bus.start()
-        self._client = open_client(client_settings(self._settings))
+        self.settings = client_settings(self._settings)
+        self._client = open_client(self.settings)
         self.session = await asyncio.to_thread(self._client.__enter__)
         return self
 
@@ -100,6 +101,24 @@ async def test_late_subscriber_gets_the_kept_messages() -> None:
     assert events == list(range(50, last + 2))
     assert [number for name, number in received if name == "status"] == [last]
     assert not [number for name, number in received if name == "vehicle"]
+
+
+async def test_client_that_has_gone_is_one_event() -> None:
+    events: list[tuple[str, str]] = []
+    async with OpenBus() as opened:
+        opened.bus._on_event = lambda *event: events.append(event)
+        client = open_client(opened.settings)
+        session = await asyncio.to_thread(client.__enter__)
+        received = opened.session.liveliness().declare_subscriber(topics.client_key("alpha", "*"))
+        token = session.liveliness().declare_token(topics.client_key("alpha", "ros2-node"))
+        await asyncio.to_thread(received.recv)
+        assert not events
+        await asyncio.to_thread(client.__exit__, None, None, None)
+        await until(lambda: bool(events))
+        del token
+    ((level, text),) = events
+    assert level == "warning"
+    assert text.startswith("ros2-node ")
 
 
 async def test_nothing_is_built_without_a_subscriber() -> None:

@@ -17,8 +17,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from zenoh import SampleKind
 
-from companion.bus.topics import CAMERA_INFO, DETECTIONS, IMAGE, LABELS, VELOCITY
+from companion.bus.topics import CAMERA_INFO, DETECTIONS, IMAGE, LABELS, VELOCITY, client_key
 from companion.host.child_process import supervised
 from companion.host.peer_data import parse_object
 from companion.ros2.cdr import encode
@@ -136,6 +137,10 @@ def test_killed_node_comes_back_with_one_event(ros: str, bus: BusSide) -> None:
     with running_node(ros, bus.endpoint) as node, ros_peer(ros) as peer:
         peer.subscribe("/drone1/labels", STRING)
         bus.wait_for_reader(LABELS)
+        clients: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        key = client_key(VEHICLE, "*")
+        watch = bus.session.liveliness().declare_subscriber(key, clients.put, history=True)
+        assert clients.get(timeout=WAIT_S).kind == SampleKind.PUT
         noted = len(node.lines)
         os.kill(process_of_node(node), signal.SIGKILL)
         node.wait_for_line("code -9")
@@ -144,6 +149,9 @@ def test_killed_node_comes_back_with_one_event(ros: str, bus: BusSide) -> None:
         assert peer.message_of("/drone1/labels", lambda: bus.put(LABELS, "car")) == {"data": "car"}
         node.last_lines()  # reads them
         assert sum("restarting" in line for line in node.lines) == 1
+        kinds = [clients.get(timeout=WAIT_S).kind for _ in range(2)]
+        watch.undeclare()  # type: ignore[no-untyped-call]
+    assert kinds == [SampleKind.DELETE, SampleKind.PUT]  # the service makes one event of it
 
 
 @pytest.mark.slow
