@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import posixpath
 import shutil
 import socket
 import subprocess
@@ -25,6 +26,7 @@ from companion.host.child_process import supervised
 from companion.ros2 import node as protocol
 from companion.ros2.gateway import Losses, NodeTopic, ServiceClock
 from companion.ros2.images import ros_cameras
+from companion.ros2.messages import OUTPUT_TOPICS, topic_name
 from companion.ros2.wiring import connected, namespace_of
 from companion.settings import Settings
 
@@ -228,18 +230,31 @@ def _shut(connection: socket.socket) -> None:
         connection.shutdown(socket.SHUT_RDWR)
 
 
+def _published(settings: Settings) -> set[str]:
+    """Full names of what a node publishes of the bus, where no argument of ROS renames it."""
+    namespace = namespace_of(settings)
+    names = (topic_name(topic, camera) for camera in (None, *settings.cameras) for topic in OUTPUT_TOPICS)
+    return {posixpath.join("/", namespace, name) for name in names}
+
+
 async def run_node(
     settings: Settings, python: str, arguments: Sequence[str], ending: Event, say: Callable[[str], None]
 ) -> None:
     """Run the node of a vehicle until `ending` is set. It waits for the service, however late it comes.
 
     Raises:
-        Ros2Error: ROS refuses the node, for example its name. SourceError: a wrong `ros://` address.
+        Ros2Error: ROS refuses the node, for example its name; a source is a topic of the node itself.
+        SourceError: a wrong `ros://` address.
     """
     ros2, clock, is_connected, refused = settings.ros2, ServiceClock(), False, ""
     token: zenoh.LivelinessToken | None = None
     uris = [uri for source in settings.sources().values() for uri in (source.uri, source.depth) if uri]
     cameras = ros_cameras(uris, say, clock.on_frame)
+    images = {topic: kind for camera in cameras for topic, kind in camera.topics.items()}
+    for topic in sorted(images.keys() & _published(settings)):
+        raise Ros2Error(
+            f"{topic} is no source: this node publishes it; set ros2.namespace, or rename the other"
+        )
     with ExitStack() as stack:
         opening = open_patiently(client_settings(settings.zenoh), ending, say)
         if (session := await asyncio.to_thread(stack.enter_context, opening)) is None:
@@ -272,7 +287,6 @@ async def run_node(
             on_clock=clock.on_ros_time,
             say=say,
         )
-        images = {topic: kind for camera in cameras for topic, kind in camera.topics.items()}
         node.declare(
             *(
                 NodeTopic(

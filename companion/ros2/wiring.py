@@ -40,6 +40,7 @@ def connected(
     """
 
     known: set[str] = set()
+    owners: dict[str, str] = {}  # name in ROS: camera
 
     def publish_result(cdr: bytes) -> None:
         for node in nodes:
@@ -49,9 +50,12 @@ def connected(
         with suppress(ValueError, KeyError, TypeError):  # of another version
             status = parse_object(message_of(sample, STATUS)[0])
             clock.on_status(int(status["unix_offset_ns"]))
-            for camera in status["cameras"].keys() - known:
+            for camera in sorted(status["cameras"].keys() - known):
                 known.add(camera)
-                gateway.offer(camera)
+                if (owner := owners.setdefault(ros_name(camera), camera)) == camera:
+                    gateway.offer(camera)
+                else:
+                    say(f"camera {camera!r} is left out: its topics are those of {owner!r}; rename one")
 
     vehicle = settings.vehicle.name
     gateway = Gateway(bus, vehicle, Messages(frame_prefix(namespace), clock.ros_time_ns), nodes, say)

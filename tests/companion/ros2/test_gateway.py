@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import asyncio
 import json
 import queue
 import re
@@ -28,7 +29,7 @@ from companion.ros2 import node as node_file
 from companion.ros2.cdr import decode, encode
 from companion.ros2.gateway import Gateway, NodeTopic, ServiceClock
 from companion.ros2.messages import OUTPUT_TOPICS, Messages, frame_prefix, ros_name, topic_name
-from companion.ros2.process import Ros2Error, find_python
+from companion.ros2.process import Ros2Error, find_python, run_node
 from companion.ros2.requests import STRING, TWIST, TWIST_STAMPED, Requests, _mission
 from companion.ros2.wiring import connected, namespace_of
 from companion.settings import Settings, ZenohSection
@@ -135,10 +136,12 @@ class ListNode:
 
     def __init__(self) -> None:
         self.topics: dict[str, NodeTopic] = {}
+        self.declared: list[str] = []
         self.published: queue.SimpleQueue[tuple[str, bytes]] = queue.SimpleQueue()
 
     def declare(self, *topics: NodeTopic) -> None:
         self.topics.update((topic.name, topic) for topic in topics)
+        self.declared += [topic.name for topic in topics]
 
     def send(self, name: str, payload: bytes) -> None:
         self.published.put((name, payload))
@@ -227,6 +230,20 @@ def test_cameras_of_the_status_are_followed(bus: BusSide) -> None:
             assert "cameras/down/fix" not in node.topics
 
 
+@pytest.mark.realtime
+def test_camera_whose_topics_another_one_has_is_named(bus: BusSide) -> None:
+    lines: queue.SimpleQueue[str] = queue.SimpleQueue()
+    bus.put_status("a_b", "a-b", "c")
+    with open_client(client_settings(ZenohSection(listen=(bus.endpoint,)))) as session:
+        node, vehicle = ListNode(), Settings.model_validate({"vehicle": {"name": VEHICLE}})
+        with connected(session, vehicle, "", ServiceClock(), [node], lines.put):
+            wait_until(lambda: "cameras/c/labels" in node.topics)
+    assert node.declared.count("cameras/a_b/labels") == 1
+    (line,) = (line for line in (lines.get_nowait() for _ in range(lines.qsize())) if "camera" in line)
+    assert "'a-b'" in line
+    assert "'a_b'" in line
+
+
 def test_python_without_rclpy_is_one_line_with_what_to_source(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     with pytest.raises(Ros2Error) as raised:
@@ -236,6 +253,13 @@ def test_python_without_rclpy_is_one_line_with_what_to_source(monkeypatch: pytes
     assert "\n" not in str(raised.value)
     with pytest.raises(Ros2Error, match="no_such_python"):
         find_python("/no_such_python")
+
+
+@pytest.mark.parametrize("uri", ["ros://cam?info=camera_info", "ros://cameras/down/image"])
+def test_source_that_the_node_itself_publishes_is_refused(uri: str) -> None:
+    values = {"source": {"uri": uri}, "ros2": {"namespace": ""}, "cameras": {"down": {}}}
+    with pytest.raises(Ros2Error, match=r"ros2\.namespace"):
+        asyncio.run(run_node(Settings.model_validate(values), "", (), threading.Event(), print))
 
 
 def test_command_without_ros_has_exit_code_2() -> None:
