@@ -173,12 +173,11 @@ class ZenohNode:
         assert topic.on_serialized is not None
         try:
             payload = memoryview(copy_payload(sample.payload, LARGEST_JSON_BYTES))
-            now_ns, about = time.time_ns(), sample.attachment
-            sent_ns = (
-                now_ns if about is None else _ATTACHMENT.unpack(copy_payload(about, _ATTACHMENT.size))[1]
-            )
-            stamps = time.monotonic_ns(), now_ns, now_ns - sent_ns
-            topic.on_serialized(topic.name, topic.type_name, payload, *stamps)
+            now_ns, age_ns, about = time.time_ns(), 0, sample.attachment
+            if about is not None and len(about) == _ATTACHMENT.size:
+                age_ns = now_ns - _ATTACHMENT.unpack(copy_payload(about, _ATTACHMENT.size))[1]
+            received_ns = time.monotonic_ns()
+            topic.on_serialized(topic.name, topic.type_name, payload, received_ns, now_ns, age_ns)
         except Exception as error:  # no message may end the thread
             self._losses.add(topic.name, f"{topic.name}: message left out: {error}")
 

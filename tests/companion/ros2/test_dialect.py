@@ -292,6 +292,25 @@ def receiving(endpoint: str, domain_id: int, topics: list[tuple[str, str]]) -> I
             process.kill()
 
 
+def test_both_types_of_a_topic_are_received_with_their_age(graph: Graph) -> None:
+    stamped = "geometry_msgs/msg/TwistStamped"
+    with graph.session() as ours, graph.session() as others:
+        received: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+
+        def on_twist(_: str, type_name: str, __: memoryview, ___: int, ____: int, age_ns: int) -> None:
+            received.put((type_name, age_ns))
+
+        graph.node(ours).declare(NodeTopic("cmd_vel", TWIST, on_twist, other_type=stamped))
+        for kind, age_ns in ((TWIST, 5 * 10**9), (stamped, 0)):
+            with others.declare_publisher(NODE.rmw_key("cmd_vel", kind)) as publisher:
+                until(lambda: bool(publisher.matching_status.matching))
+                about = attachment(1, time.time_ns() - age_ns, bytes(16)) if age_ns else None
+                publisher.put(encode(kind, {}), attachment=about)
+                found = received.get(timeout=WAIT_S)
+                assert found[0] == kind
+                assert found[1] >= age_ns if age_ns else found[1] == 0
+
+
 @pytest.mark.realtime
 @pytest.mark.needs("pyzeros")
 def test_pyzeros_gets_every_topic_through_a_router_that_is_restarted() -> None:
