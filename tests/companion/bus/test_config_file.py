@@ -33,6 +33,15 @@ def test_keys_of_the_file_replace_defaults(file: Path) -> None:
         assert value(settings, key) == value(ZenohSection(), key)
 
 
+def test_queues_of_express_messages_are_ours_unless_the_file_has_them(tmp_path: Path) -> None:
+    path, sizes = tmp_path / "zenoh.json5", "transport/link/tx/queue/size"
+    path.write_text("{transport: {link: {tx: {queue: {size: {real_time: 4}}}}}}")
+    found = value(ZenohSection(), f"{sizes}/real_time"), value(ZenohSection(), f"{sizes}/data_high")
+    assert found == (16, 16)
+    settings = ZenohSection(config_file=str(path))
+    assert (value(settings, f"{sizes}/real_time"), value(settings, f"{sizes}/data_high")) == (4, 16)
+
+
 def test_given_setting_that_differs_is_an_error(file: Path) -> None:
     given = ZenohSection(listen=("tcp/127.0.0.1:7447",), config_file=str(file))
     with pytest.raises(BusError, match=r"zenoh\.listen .*7447.*endpoints .*7999") as error:
