@@ -75,9 +75,9 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The answer to a command: its MAV_RESULT, then messages."""
+    """The answer to a command: its MAV_RESULT (None: it is acknowledged later, by `due`), then messages."""
 
-    result: int = ACCEPTED
+    result: int | None = ACCEPTED
     messages: Sequence[Message] = ()
 
 
@@ -117,6 +117,8 @@ class RequestTable:
         sender = (message.get_srcSystem(), message.get_srcComponent())
         command = Command(message.command, tuple(map(float, values)), sender, confirmation, now_ns)
         answer = self._answer(command)
+        if answer.result is None:
+            return []
         if answer.result == UNSUPPORTED and message.target_component == 0:
             return []
         return [
@@ -149,6 +151,8 @@ class RequestTable:
             self._executed[key] = before
             return Answer(before[1])
         answer = action(command)
+        if answer.result is None:
+            return answer
         self._executed[key] = command, answer.result
         if len(self._executed) > _MOST_SENDERS:
             self._executed.pop(next(iter(self._executed)))

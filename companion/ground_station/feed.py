@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import queue
 from collections import deque
-from collections.abc import Callable
-from threading import Lock
+from collections.abc import Callable, Mapping
+from threading import Lock, Thread
 from typing import Any
 
 import zenoh
 
 from companion.bus.child_client import ChildClient
-from companion.bus.client import message_of, subscribe_kept
+from companion.bus.client import NoAnswerError, message_of, send_command, subscribe_kept
 from companion.bus.topics import IMAGE, Topic
 from companion.host.peer_data import PeerDataError, parse_object
 
@@ -23,6 +23,8 @@ OnImage = Callable[[bytes, int], None]
 
 _IMAGES_KEPT = 2
 _POLL_S = 0.5
+# A click that the service answers later flies nothing.
+_ANSWER_S = 5.0
 
 
 class BusFeed:
@@ -39,6 +41,7 @@ class BusFeed:
         self._topics: list[tuple[Topic, str | None, OnMessage, int]] = []
         self._users: dict[str | None, dict[str, OnImage]] = {}
         self._changes: queue.SimpleQueue[tuple[str | None, bool] | None] = queue.SimpleQueue()
+        self._session: zenoh.Session | None = None
 
     def subscribe(self, topic: Topic, camera: str | None, on_message: OnMessage, kept: int = 16) -> None:
         """Subscribe to a topic, before `run`. `kept`: messages that may wait for the loop."""
@@ -55,11 +58,29 @@ class BusFeed:
         if bool(users) != before:
             self._changes.put((camera, bool(users)))
 
+    def send_command(self, text: str, on_reply: Callable[[Mapping[str, Any]], None]) -> None:
+        """Send a command to the service, and call back in the loop with its reply or why there is none."""
+        if (session := self._session) is None:
+            refused = {"success": False, "reason": "the service is not reached"}
+            self._loop.call_soon(on_reply, refused)
+            return
+
+        def run() -> None:
+            try:
+                reply = send_command(session, self._vehicle, text, timeout_s=_ANSWER_S)
+            except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
+                reply = {"success": False, "reason": str(error)}
+            if not self._loop.is_closed():
+                self._loop.call_soon_threadsafe(on_reply, reply)
+
+        Thread(target=run, name="command", daemon=True).start()
+
     def run(self, on_open: Callable[[], None]) -> None:
         """Open the bus, however late it comes, and keep the subscriptions until the end. In a thread."""
         with self._client.open_bus() as session:
             if session is None:
                 return
+            self._session = session
             kept = [self._declare(session, *each) for each in self._topics]
             self._loop.call_soon_threadsafe(on_open)
             images: dict[str | None, Any] = {}
@@ -76,6 +97,7 @@ class BusFeed:
                     images[camera] = self._declare(session, IMAGE, camera, receive, _IMAGES_KEPT)
                 else:
                     images.pop(camera).undeclare()
+            self._session = None
             kept.clear()
 
     def close(self) -> None:
