@@ -12,18 +12,29 @@ from typing import Any, cast
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.bus.bodies.frames import CameraInfoBody
+from companion.bus.bodies.frames import CameraInfoBody, DetectionsBody
+from companion.bus.bodies.service import CommandStateBody, StatusBody
 from companion.bus.bodies.vehicle import VehicleBody
 from companion.bus.child_client import LISTENING, ChildClient, run_child
-from companion.bus.topics import CAMERA_INFO, EVENTS, STATUS, TRANSFORMS, VEHICLE
+from companion.bus.topics import (
+    CAMERA_INFO,
+    COMMAND_STATE,
+    DETECTIONS,
+    EVENTS,
+    STATUS,
+    TRANSFORMS,
+    VEHICLE,
+)
 from companion.ground_station import GroundStationError
 from companion.ground_station.camera import COMPONENT_IDS, Camera
 from companion.ground_station.captures import Captures
 from companion.ground_station.component import Message
 from companion.ground_station.feed import BusFeed
 from companion.ground_station.link import StationLink
+from companion.ground_station.objects import Objects
 from companion.ground_station.positions import Positions
 from companion.ground_station.reports import ComputerStatus, StatusTexts
+from companion.ground_station.tracking import FLAGS, Tracking
 from companion.ground_station.video import serving_video
 from companion.host.peer_data import parse_object
 from companion.settings.operator import GroundStationSection
@@ -65,6 +76,8 @@ async def _run(client: ChildClient) -> None:
     feed = BusFeed(client, options["vehicle"])
     _subscribe(feed, cameras, texts)
     cameras[0].sources.append(_report_losses(feed, texts, client.say))
+    for camera, about in zip(cameras, options["cameras"], strict=False):
+        _track(feed, camera, about, texts, section)
     open_parts: set[str] = set()
 
     def on_open(part: str) -> None:
@@ -150,6 +163,41 @@ def _report_losses(
         return []
 
     return due
+
+
+def _track(
+    feed: BusFeed, camera: Camera, about: dict[str, Any], texts: StatusTexts, section: GroundStationSection
+) -> None:
+    """Add the tracking and the objects of a camera."""
+
+    def say(severity: int, text: str) -> None:
+        texts.add(severity, text, time.monotonic_ns())
+
+    tracking = Tracking(
+        about["word"],
+        lambda: camera.component_id,
+        camera.requests,
+        max_age_s=about["max_age_s"],
+        steers=about["steers"],
+        follows=section.track_follows,
+        send=feed.send_command,
+        say=say,
+    )
+    camera.flags |= FLAGS
+    camera.sources += [tracking.due, Objects(tracking, target_relative=section.target_relative).due]
+
+    def on_status(payload: bytes, _attachment: bytes | None) -> None:
+        tracking.on_service(cast("StatusBody", parse_object(payload))["service"])
+
+    def on_detections(payload: bytes, _attachment: bytes | None) -> None:
+        tracking.on_detections(cast("DetectionsBody", parse_object(payload)))
+
+    def on_command_state(payload: bytes, _attachment: bytes | None) -> None:
+        tracking.on_command_state(cast("CommandStateBody", parse_object(payload)))
+
+    feed.subscribe(STATUS, None, on_status)
+    feed.subscribe(DETECTIONS, camera.name, on_detections)
+    feed.subscribe(COMMAND_STATE, None, on_command_state, _EVENTS_KEPT)
 
 
 def _on_camera_info(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:

@@ -13,6 +13,7 @@ from companion.bus.child_client import LISTENING, PAUSED
 from companion.bus.client import NoAnswerError, settings_for_child
 from companion.bus.config import BusError
 from companion.bus.topics import IMAGE
+from companion.guidance.behaviours.select import FIRST_CAMERA
 from companion.guidance.core import GuidanceOptions
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.limits.battery import BatteryMinimum
@@ -142,7 +143,7 @@ def _clients(settings: Settings) -> Iterator[tuple[str, _Client]]:
 
 
 def _ground_station_options(settings: Settings) -> dict[str, Any]:
-    cameras = {name: settings.of_camera(name).camera for name in (None, *settings.cameras)}
+    cameras = {name: settings.of_camera(name) for name in (None, *settings.cameras)}
     return {
         "settings": settings.ground_station.model_dump(mode="json"),
         "system_id": settings.vehicle.system_id,
@@ -150,7 +151,16 @@ def _ground_station_options(settings: Settings) -> dict[str, Any]:
         "directory": settings.recording.directory or None,
         "image_rate_hz": settings.preview.rate_hz,
         "image_width": settings.preview.width,
-        "cameras": [{"name": name, "field_rad": camera.field_rad} for name, camera in cameras.items()],
+        "cameras": [
+            {
+                "name": name,
+                "field_rad": camera.camera.field_rad,
+                "word": name or FIRST_CAMERA,
+                "steers": name == settings.guidance.camera,
+                "max_age_s": camera.tracker.max_age_s,
+            }
+            for name, camera in cameras.items()
+        ],
     }
 
 

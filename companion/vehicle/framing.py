@@ -21,6 +21,7 @@ _FLAG_SIGNED = 0x01
 COMPONENT_METADATA_ID = 397
 EVENT_ID, CURRENT_EVENT_SEQUENCE_ID, REQUEST_EVENT_ID = 410, 411, 412
 CURRENT_MODE_ID = 436
+TARGET_RELATIVE_ID = 511  # of development.xml
 EKF_STATUS_REPORT_ID = 193  # ArduPilot's own
 CRC_EXTRA: dict[int, int] = {
     **{message_id: message.crc_extra for message_id, message in mavlink.mavlink_map.items()},
@@ -29,6 +30,7 @@ CRC_EXTRA: dict[int, int] = {
     CURRENT_EVENT_SEQUENCE_ID: 106,
     REQUEST_EVENT_ID: 33,
     CURRENT_MODE_ID: 193,
+    TARGET_RELATIVE_ID: 28,
     EKF_STATUS_REPORT_ID: 71,
 }
 
