@@ -48,9 +48,10 @@ def joined_names(pieces: Sequence[str], class_names: Sequence[str]) -> tuple[str
     A piece that is a class by itself is not joined.
     """
     known = {fold_name(each) for each in class_names}
+    most = 1 + max((each.count(",") for each in known), default=0)
     names, begin = list[str](), 0
     while begin < len(pieces):
-        ends = range(begin + 1, len(pieces) + 1)
+        ends = range(begin + 1, min(begin + most, len(pieces)) + 1)
         end = next((end for end in ends if fold_name(",".join(pieces[begin:end])) in known), begin + 1)
         names.append(",".join(pieces[begin:end]))
         begin = end

@@ -154,8 +154,12 @@ class Detector(ObjectDetector):
             device=device,
         )
         self._runtime = started.runtime
+        # At a lower one thousands of cells would be decoded one by one.
+        self.min_confidence = _SPARSE_FROM if confidence >= _SPARSE_FROM else 0.0
         self.foreign: ForeignFacts | None = None
-        if isinstance(started.runtime, ForeignRuntime):
+        if not isinstance(started.runtime, ForeignRuntime):
+            self.reportable_ids = started.runtime.head.class_ids
+        else:
             self.foreign = started.runtime.facts
             box = started.runtime.fit(image_size, image_size, image_size, square=square)
             self.image_size = max(box.width, box.height)
@@ -321,9 +325,12 @@ class _FilteredDetector(ObjectDetector):
         self.class_names = tuple(inner.class_names)
         self.model_name, self.model_sha256 = inner.model_name or kind, inner.model_sha256
         self.runtime, self.precision, self.reason = inner.runtime, inner.precision, inner.reason
-        self._inner, self._confidence, self._kind = inner, settings.confidence, kind
+        self._inner, self._kind = inner, kind
         wanted = settings.classes
-        self._class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
+        self.class_ids = None if wanted is None else resolve_classes(wanted, self.class_names)
+        # It may have used them itself.
+        self.confidence = self.min_confidence = settings.confidence
+        self.reportable_ids = self.class_ids
 
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:
         started = time.perf_counter()
@@ -339,9 +346,9 @@ class _FilteredDetector(ObjectDetector):
                 f"detector.kind {self._kind!r}: detections must have its class names {self.class_names}, "
                 f"got {found.class_names}"
             )
-        kept = found.confidence >= self._confidence
-        if self._class_ids is not None:
-            kept &= np.isin(found.class_id, self._class_ids)
+        kept = found.confidence >= self.confidence
+        if self.class_ids is not None:
+            kept &= np.isin(found.class_id, self.class_ids)
         return found[kept]
 
 

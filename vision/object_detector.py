@@ -80,6 +80,9 @@ class ObjectDetector(ABC):
         precision: `float32` for example; None where it does not apply.
         reason: why this runtime and precision, in words.
         rendered_only: its network was trained on rendered scenes only, as far as its file says.
+        confidence, class_ids: what the detector of `vision.detector.open_detector` reports: boxes from this
+            confidence on, of these classes, sorted; None: of all. May be set between two frames, within
+            `min_confidence` and `reportable_ids` (None: all), for which it was loaded.
 
     >>> import numpy as np
     >>> from vision import Detections, ObjectDetector
@@ -100,6 +103,10 @@ class ObjectDetector(ABC):
     precision: str | None = None
     reason: str = ""
     rendered_only: bool = False
+    confidence: float = 0.0
+    class_ids: tuple[int, ...] | None = None
+    min_confidence: float = 0.0
+    reportable_ids: tuple[int, ...] | None = None
 
     @abstractmethod
     def detect(self, image_bgr: NDArray[np.uint8], /) -> Detections:

@@ -104,6 +104,7 @@ class Pipeline:
 
     Attributes:
         frames: frames read so far.
+        tracker: of every processed frame; None without one or without a detector.
         object_selection: follows an object that an operator selects; None without a tracker.
 
     >>> import tempfile
@@ -156,10 +157,10 @@ class Pipeline:
         self._selector = FrameSelector(max_rate_hz)
         self._changes = FrameChanges()
         self._recorder = recorder
-        self._tracker = tracker if detector is not None else None
+        self.tracker = tracker if detector is not None else None
         self.object_selection: ObjectSelection | None = None
-        if self._tracker is not None:
-            self.object_selection = ObjectSelection(self._tracker.settings, self._tracker.take_id)
+        if self.tracker is not None:
+            self.object_selection = ObjectSelection(self.tracker.settings, self.tracker.take_id)
         self._view_at = view_at
         self._find_markers = find_markers
         self._obstacles_in = obstacles_in
@@ -233,9 +234,9 @@ class Pipeline:
                 timing_ms["postprocess"] = timing.postprocess_ms
         detected_ns = time.perf_counter_ns()
         events: tuple[TrackEvent, ...] = ()
-        if self._tracker is not None:
+        if self.tracker is not None:
             view = self._view_at(frame)
-            tracked = self._tracker.update(detections, self._tracker_stamp_ns(frame), view, frame.image)
+            tracked = self.tracker.update(detections, self._tracker_stamp_ns(frame), view, frame.image)
             if self.object_selection is not None:
                 tracked = self.object_selection.update(frame, tracked, view)
             detections, events = tracked.detections, tracked.events

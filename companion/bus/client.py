@@ -27,6 +27,7 @@ from companion.bus.topics import (
     Topic,
     alive_key,
     command_key,
+    settings_key,
 )
 from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 from companion.settings import ZenohSection
@@ -147,6 +148,10 @@ def only_vehicle(session: zenoh.Session) -> str | None:
     return names[0] if names else None
 
 
+class SettingsRefusedError(RuntimeError):
+    """A service does not change its settings so. The message is one line."""
+
+
 class LastStatus:
     """What a service has said last about its vehicle, for the time when it says nothing any more."""
 
@@ -235,6 +240,27 @@ def send_command(
     finally:
         status.close()
         watching.undeclare()  # type: ignore[no-untyped-call]
+
+
+def set_settings(
+    session: zenoh.Session, vehicle: str, values: dict[str, Any] | None = None, *, timeout_s: float = 5.0
+) -> dict[str, Any]:
+    """Change settings of a running service, all or none; returns key → `LiveSettingBody` of all that can be.
+
+    Args:
+        values: key → value; None: change none.
+
+    Raises:
+        SettingsRefusedError: by the service. NoAnswerError: no answer. PeerDataError: it cannot be used.
+    """
+    payload = None if values is None else json.dumps(values)
+    for reply in session.get(settings_key(vehicle), payload=payload, timeout=timeout_s):
+        if reply.ok is not None:
+            return parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES))
+        if reply.err is not None:
+            refused = parse_object(copy_payload(reply.err.payload, LARGEST_JSON_BYTES))
+            raise SettingsRefusedError(str(refused.get("reason")))
+    raise NoAnswerError(f"no settings of vehicle {vehicle!r} within {timeout_s:g} s: check vehicle.name")
 
 
 def _answer(

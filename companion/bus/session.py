@@ -30,14 +30,16 @@ from companion.bus.listeners import Listener, ListenerQueue
 from companion.bus.topics import (
     RECORDER_TOPICS,
     ROOT,
+    SETTINGS,
     TOPICS,
     VIEW_TOPICS,
     Topic,
     alive_key,
     client_key,
     command_key,
+    settings_key,
 )
-from companion.host.peer_data import Payload, copy_payload
+from companion.host.peer_data import Payload, PeerDataError, copy_payload
 from companion.host.scheduling import set_scheduler_slice
 from companion.host.tasks import error_text, keep_running, spawn
 from companion.settings import ZenohSection
@@ -49,7 +51,10 @@ logger = logging.getLogger(__name__)
 
 CommandHandler = Callable[[str], Awaitable[dict[str, Any]]]
 QueryHandler = Callable[[], Awaitable[Any]]
+PayloadHandler = Callable[[bytes], Awaitable[Any]]
 _Publisher = zenoh.Publisher | ext.AdvancedPublisher
+
+LARGEST_SETTINGS_BYTES = 8 * 1024
 
 _RETRY_MIN_S, _RETRY_MAX_S = 0.5, 5.0
 _WATCH_PERIOD_S = 0.25
@@ -84,6 +89,8 @@ class Bus:
         on_command: returns a command's JSON-able reply; called in the loop, one task each.
         queries: path of a queryable → function that returns its reply, a body or a JPEG; called as
             `on_command`. A TimeoutError or KeyError is replied as an error.
+        on_settings: the same for `settings`, with the query's payload, of at most `LARGEST_SETTINGS_BYTES`. A
+            PeerDataError is replied as an error.
         views: names of the views that publish besides the first.
         listeners: to topics of other programs.
 
@@ -102,6 +109,7 @@ class Bus:
         on_event: Callable[[str, str], None],
         on_command: CommandHandler,
         queries: Mapping[str, QueryHandler] = MappingProxyType({}),
+        on_settings: PayloadHandler | None = None,
         views: Sequence[str] = (),
         listeners: Sequence[Listener] = (),
     ) -> None:
@@ -110,7 +118,7 @@ class Bus:
         self._on_event = on_event
         self._on_command = on_command
         self._session: zenoh.Session | None = None
-        self._queries = dict(queries)
+        self._queries, self._on_settings = dict(queries), on_settings
         self._publishers: dict[str, _Publisher] = {}
         self._watched: dict[str, bool] = {}
         self._matching: list[zenoh.MatchingListener[None]] = []
@@ -321,6 +329,9 @@ class Bus:
         ]
         clients = client_key(self._vehicle, "*")
         self._subscribers = [session.liveliness().declare_subscriber(clients, self._on_client)]
+        if self._on_settings is not None:
+            answer = partial(self._on_settings_query, self._on_settings)
+            self._queryables.append(session.declare_queryable(settings_key(self._vehicle), answer))
         for listener in self.listeners:
             queue = ListenerQueue(listener, self._call_soon, self._on_event)
             self._received.append(queue)
@@ -406,17 +417,29 @@ class Bus:
             # The sender always gets a reply, since it must not send the command again.
             await self._in(self._command_replies, _reply, query, reply)
 
+    def _on_settings_query(self, handler: PayloadHandler, query: zenoh.Query) -> None:
+        payload = query.payload
+        try:
+            data = b"" if payload is None else copy_payload(payload, LARGEST_SETTINGS_BYTES)
+        except PeerDataError as error:
+            _reply_error(query, f"{SETTINGS}: {error}")
+            return
+        self._accept_query(SETTINGS, partial(handler, data), query)
+
     def _on_query(self, path: str, query: zenoh.Query) -> None:
+        self._accept_query(path, self._queries[path], query)
+
+    def _accept_query(self, path: str, handler: QueryHandler, query: zenoh.Query) -> None:
         loop = self._loop
         if not self._query_allowance.take():
             _reply_error(query, f"more than {COMMANDS_PER_S:g} queries a second; send it again later")
         elif loop is not None and not loop.is_closed():
-            loop.call_soon_threadsafe(lambda: self._spawn(self._answer_query(path, query)))
+            loop.call_soon_threadsafe(lambda: self._spawn(self._answer_query(path, handler, query)))
 
-    async def _answer_query(self, path: str, query: zenoh.Query) -> None:
+    async def _answer_query(self, path: str, handler: QueryHandler, query: zenoh.Query) -> None:
         try:
-            body = await self._queries[path]()
-        except (TimeoutError, KeyError) as error:
+            body = await handler()
+        except (TimeoutError, KeyError, PeerDataError) as error:
             await self._in(self._query_replies, _reply_error, query, f"{path}: {error}")
             return
         except Exception as error:  # else its sender would wait until its own time-out

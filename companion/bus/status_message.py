@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from companion.bus.bodies.service import (
+    ChangedSettingBody,
     OtherCommanderBody,
     PartBody,
     StatusBody,
@@ -51,6 +52,7 @@ def status_message(
     bus: Bus,
     others: list[OtherCommanderBody],
     dropped_lines: int,
+    changed_settings: list[ChangedSettingBody],
 ) -> StatusBody:
     """Create the message published on `status` (`docs/messages.md`).
 
@@ -116,6 +118,7 @@ def status_message(
             "fence_include": _corners(limits.fence.include),
             "fence_exclude": [_corners(polygon) for polygon in limits.fence.exclude],
         },
+        "changed_settings": changed_settings,
         "perception": _camera(cameras[0].supervisor),
         "cameras": {camera.name: _camera(camera.supervisor) for camera in cameras if camera.name},
         "targets": {

@@ -325,6 +325,9 @@ RECORDER_TOPICS: Final = (RUN, GUIDANCE_INPUT, GUIDANCE_OUTPUT, MAVLINK)
 # The last part of the key of the queryable that executes a command and returns its result.
 COMMAND: Final = "command"
 
+# The same of the queryable that answers and changes a few settings.
+SETTINGS: Final = "settings"
+
 
 def command_id(service: str, number: int) -> str:
     """Return the `id` of a command: `service` of its service's status, and its number there."""
@@ -342,6 +345,11 @@ def command_key(vehicle: str) -> str:
 def client_key(vehicle: str, name: str) -> str:
     """Return the key of a client's liveliness token: the service makes an event of its end."""
     return f"{ROOT}/{vehicle}/clients/{name}"
+
+
+def settings_key(vehicle: str) -> str:
+    """Return the key of the queryable for one vehicle's settings that can be changed."""
+    return f"{ROOT}/{vehicle}/{SETTINGS}"
 
 
 def alive_key(vehicle: str) -> str:

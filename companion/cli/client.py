@@ -20,7 +20,7 @@ from companion.cli.flags import (
 if TYPE_CHECKING:
     from companion.settings import Settings
 
-_COMMAND_TIMEOUT_S, _MISSION_TIMEOUT_S = 300.0, 3600.0
+_COMMAND_TIMEOUT_S, _MISSION_TIMEOUT_S, _SET_TIMEOUT_S = 300.0, 3600.0, 5.0
 
 
 def known_commands() -> str:
@@ -47,6 +47,15 @@ def send(
             help="With --file: only check it, including the detector's classes, and print the plan.",
         ),
     ] = False,
+    changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Instead of a command: change a limit of guidance, or what a detector reports, until the "
+            "next start, for example guidance.max_altitude_m=20. Several: all or none.",
+        ),
+    ] = None,
     timeout: Annotated[
         float | None,
         typer.Option(min=0.1, help="Seconds to wait for the outcome. Default: 300, of a mission 3600."),
@@ -60,8 +69,11 @@ def send(
     from companion.settings.plugins import PluginError
 
     check_belonging(context, "--file", ("check",), chosen=file is not None)
-    if (command is None) == (file is None):
-        refuse("expected a command, such as companion send hold, or --file FILE, one of them")
+    if (command is not None) + (file is not None) + bool(changes) != 1:
+        refuse("expected a command, such as companion send hold, or --file FILE, or --set, one of them")
+    if changes:
+        _set(settings, changes, timeout)
+        return
     limit_s = timeout or (_COMMAND_TIMEOUT_S if file is None else _MISSION_TIMEOUT_S)
     with plain_errors(MissionError, NoAnswerError, BusError, PluginError, ValueError):
         text = command if file is None else _mission_text(settings, file, check=check)
@@ -73,6 +85,31 @@ def send(
     typer.echo(reply_text(reply))
     if not reply["success"]:
         raise typer.Exit(EXIT_FAILED)
+
+
+def _set(settings: Settings, changes: list[str], timeout: float | None) -> None:
+    """Change settings of a running service, and print those that were given, as they are now."""
+    from companion.bus.client import (
+        NoAnswerError,
+        SettingsRefusedError,
+        client_settings,
+        open_client,
+        set_settings,
+    )
+    from companion.bus.session import BusError
+    from companion.cli.log import key_and_value
+    from companion.settings.fields import toml_value
+    from companion.settings.live import live_value_of_text
+
+    refused = plain_errors(SettingsRefusedError, code=EXIT_FAILED)
+    with refused, plain_errors(NoAnswerError, BusError, ValueError):
+        pairs = dict(key_and_value(text) for text in changes)
+        values = {key: live_value_of_text(key, text) for key, text in pairs.items()}
+        with open_client(client_settings(settings.zenoh)) as session:
+            vehicle = vehicle_of(session, settings)
+            now = set_settings(session, vehicle, values, timeout_s=timeout or _SET_TIMEOUT_S)
+    for key in values:
+        typer.echo(f"{key} = {toml_value(now[key]['value'])} (file: {toml_value(now[key]['file'])})")
 
 
 def _mission_text(settings: Settings, file: str, *, check: bool) -> str:

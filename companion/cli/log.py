@@ -173,7 +173,7 @@ def replay(
 
     with plain_errors(RecordingError, ConfigurationError, PluginError, ValueError):  # of a model
         load_plugins(settings.plugins.modules)
-        found = replay_files(files, dict(map(_key_and_value, changes or ())), model)
+        found = replay_files(files, dict(map(key_and_value, changes or ())), model)
     if as_json:
         typer.echo(json.dumps(found.as_dict()))
     else:
@@ -183,7 +183,7 @@ def replay(
         raise typer.Exit(EXIT_DIFFERENT)
 
 
-def _key_and_value(text: str) -> tuple[str, str]:
+def key_and_value(text: str) -> tuple[str, str]:
     key, equals, value = text.partition("=")
     if not equals:
         raise typer.BadParameter(f"expected KEY=VALUE, got {text!r}", param_hint="--set")

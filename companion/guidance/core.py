@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 from companion.guidance.behaviour import NO_GIMBAL, Behaviour, BehaviourContext, Outcome, Requirement
 from companion.guidance.behaviour_runner import BehaviourRunner
@@ -21,6 +21,7 @@ from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.command_queue import CommandQueue, ends_flight
 from companion.guidance.gimbal.controller import ENDING, GimbalController, GimbalMounting
 from companion.guidance.interface import (
+    ChangedLimits,
     CommandInput,
     EventKind,
     GuidanceInput,
@@ -73,7 +74,7 @@ class Guidance:
     """One vehicle's guidance.
 
     Attributes:
-        options: the operator's settings, fixed at construction.
+        options: the operator's settings, fixed at construction; `GuidanceInput.limits` change later.
         gimbal, setpoints, runner: its parts; for their status.
         context: the input of behaviours at the newest step; None before the first.
     """
@@ -101,6 +102,7 @@ class Guidance:
         self._landing_target_ns = self._obstacle_distance_ns = 0
         self._standstill: Standstill | None = None
         self._refuse_until_ns = 0
+        self._changed_limits: ChangedLimits | None = None
 
     @property
     def behaviour(self) -> Behaviour | None:
@@ -151,6 +153,9 @@ class Guidance:
         out = self._out
         out.now_ns = now_ns
         out.requests, out.cancelled, out.events, out.results, out.endings = [], [], [], [], []
+        if inputs.limits is not None and inputs.limits != self._changed_limits:
+            self._changed_limits = inputs.limits
+            self.setpoints.use_limits(replace(self.options.limits, **asdict(inputs.limits)))
         self.setpoints.use_autopilot(inputs.parameters)
         for answer in inputs.answers:
             self.gimbal.take_answer(answer, now_ns, out)

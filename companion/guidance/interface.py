@@ -190,6 +190,18 @@ class GuidanceEvent:
 
 
 @dataclass(frozen=True, slots=True)
+class ChangedLimits:
+    """The limits that can be changed while the service runs, as of `guidance.limits.envelope.Limits`."""
+
+    max_horizontal_speed_mps: float
+    max_climb_mps: float
+    max_descend_mps: float
+    min_altitude_m: float
+    max_altitude_m: float
+    max_distance_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class GuidanceInput:
     """The input of one guidance step. Stamps are CLOCK_MONOTONIC nanoseconds.
 
@@ -215,6 +227,7 @@ class GuidanceInput:
         standstill: of the computer or the process, since the previous step; None: none.
         objects: of the steering camera, as of its newest frame. marker_objects: its markers in the same form.
         objects_below: the markers of cameras that look down.
+        limits: as they are now; None: as in the options, never changed.
     """
 
     state: VehicleState
@@ -240,6 +253,7 @@ class GuidanceInput:
     objects: tuple[TrackedObject, ...] = ()
     marker_objects: tuple[TrackedObject, ...] = ()
     objects_below: tuple[TrackedObject, ...] = ()
+    limits: ChangedLimits | None = field(default=None, metadata={"recorded": "if set"})
 
 
 @dataclass(frozen=True, slots=True)

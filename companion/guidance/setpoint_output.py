@@ -49,7 +49,7 @@ class SetpointOutput:
         self._lifetime_s = lifetime_s
         self._out = out
         self._limits = limits
-        self._read = NOTHING_READ
+        self._read, self._reduced = NOTHING_READ, ""
         self.altitude_acceptance_m: float | None = None
         self._envelope = Envelope(limits)
         self._memory = ObstacleMemory()
@@ -68,9 +68,17 @@ class SetpointOutput:
             return
         self._read = read
         self.altitude_acceptance_m = read.altitude_acceptance_m
-        self._envelope.limits, words = within_autopilot(self._limits, read)
-        if words:
-            self._out.event(EventKind.NOTED, "", words)
+        self._envelope.limits, self._reduced = within_autopilot(self._limits, read)
+        if self._reduced:
+            self._out.event(EventKind.NOTED, "", self._reduced)
+
+    def use_limits(self, limits: Limits) -> None:
+        """Use the operator's changed limits; what is sent follows with the maximum acceleration."""
+        self._limits, before = limits, self._reduced
+        within, self._reduced = within_autopilot(limits, self._read)
+        self._envelope.change_limits(within)
+        if self._reduced and self._reduced != before:
+            self._out.event(EventKind.NOTED, "", self._reduced)
 
     def activate(self) -> None:
         """The behaviour's first update follows."""
@@ -131,7 +139,10 @@ class SetpointOutput:
         limited, self.limited_by = self._envelope.apply(
             asked, context.state, context.now_ns, dt_s, context.neighbours, landing=landing
         )
-        self.sent = bias.command(limited, self.limits.max_horizontal_speed_mps)
+        north_mps, east_mps, _ = limited.velocity_ned_mps or (0.0, 0.0, 0.0)
+        # Above the limit after it was lowered, until the vehicle has slowed down.
+        top_mps = max(self.limits.max_horizontal_speed_mps, math.hypot(north_mps, east_mps))
+        self.sent = bias.command(limited, top_mps)
 
     def check_goals(self, goals: Sequence[Vector3], state: VehicleState) -> str | None:
         """Why a goal is outside the limits, in words; None: none is. One with a NaN is not checked."""

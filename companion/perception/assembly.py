@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.perception.messages import Detecting
 from companion.perception.path_planning import PathPlanning, PositionHistory
 from companion.settings import Settings
 from vision.camera_model import CameraMount
@@ -19,7 +20,7 @@ from vision.gc_pause import gc_paused
 from vision.levelling import Levelling, level_image, level_rotations, poses_of_readout
 from vision.marker_boards import BoardPose, locate_board
 from vision.markers import Marker, MarkerDetector
-from vision.object_detector import ObjectDetector
+from vision.object_detector import ObjectDetector, resolve_classes
 from vision.obstacle_sectors import ObstacleSectors, obstacle_sectors
 from vision.pipeline import FrameDetector, FrameRecorder, Pipeline, SurfacesIn
 from vision.sources import Source
@@ -133,6 +134,20 @@ def _min_confidence(settings: Settings) -> float:
     """Return the detector's threshold; the tracker also needs detections below `detector.confidence`."""
     confidence, tracker = settings.detector.confidence, settings.tracker
     return min(confidence, tracker.following(confidence).low_confidence) if tracker.enabled else confidence
+
+
+def change_detecting(
+    settings: Settings, change: Detecting, detector: ObjectDetector, tracker: Tracker | None
+) -> None:
+    """Set confidence and classes for the next frame. Tracks of other classes end as those of lost objects."""
+    section = settings.detector.model_copy(
+        update={"confidence": change.confidence, "classes": change.classes}
+    )
+    detector.confidence = _min_confidence(settings.model_copy(update={"detector": section}))
+    wanted = section.classes
+    detector.class_ids = resolve_classes(wanted, detector.class_names) if wanted else detector.reportable_ids
+    if tracker is not None:
+        tracker.settings = settings.tracker.following(section.confidence)
 
 
 def _tracker(settings: Settings, first_track_id: int) -> Tracker | None:

@@ -43,11 +43,13 @@ class Begin:
     Attributes:
         first_track_id: of its first track; further ones follow.
         record_as: name of the shared memory for processed frames, for a recorder; None: none.
+        detecting: instead of the settings' own, with which the detector is loaded; None: unchanged.
     """
 
     settings: Settings
     first_track_id: int = 1
     record_as: str | None = None
+    detecting: Detecting | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +96,14 @@ class Watched:
 
 
 @dataclass(frozen=True, slots=True)
+class Detecting:
+    """`detector.confidence` and `detector.classes` from the next frame on. The service has checked them."""
+
+    confidence: float
+    classes: tuple[str | int, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Stop:
     """Finish the video and end."""
 
@@ -107,7 +117,8 @@ class Ready:
 
     `model` is None without a detector; `precision` and `runtime` of the network are None without a network.
     `reason`: why these were selected, as text. `calibration`: from the camera, if it provides one.
-    `model_sha256`: of the model's file; None without one. `rendered_only`: as of `ObjectDetector`.
+    `model_sha256`: of the model's file; None without one. `rendered_only`, `min_confidence` and
+    `reportable_ids`: as of `ObjectDetector`.
     """
 
     source: str
@@ -119,6 +130,8 @@ class Ready:
     calibration: CameraCalibration | None = None
     model_sha256: str | None = None
     rendered_only: bool = False
+    min_confidence: float = 0.0
+    reportable_ids: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,6 +223,7 @@ Message = (
     | Watched
     | SelectRequest
     | PathRequest
+    | Detecting
     | Stop
     | Ready
     | StartFailed

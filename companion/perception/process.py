@@ -19,6 +19,7 @@ from companion.host.scheduling import schedule_as_any_program
 from companion.perception.messages import (
     Attitude,
     Begin,
+    Detecting,
     GimbalAttitude,
     Hud,
     Message,
@@ -68,13 +69,18 @@ class PerceptionProcess:
 
     @classmethod
     async def spawn(
-        cls, settings: Settings, standard_input: int, first_track_id: int = 1, record_as: str | None = None
+        cls,
+        settings: Settings,
+        standard_input: int,
+        first_track_id: int = 1,
+        record_as: str | None = None,
+        detecting: Detecting | None = None,
     ) -> Self:
         """Start a new interpreter with this one's module search path.
 
         Args:
             standard_input: descriptor of the worker's standard input, or `subprocess.DEVNULL`.
-            first_track_id, record_as: as in `Begin`.
+            first_track_id, record_as, detecting: as in `Begin`.
 
         Raises:
             OSError: no more processes or descriptors.
@@ -117,7 +123,7 @@ class PerceptionProcess:
             schedule_as_any_program(process.pid)
             failing.pop_all()
         worker = cls(process, reports, control, printed)
-        worker._put(Begin(settings, first_track_id, record_as))
+        worker._put(Begin(settings, first_track_id, record_as, detecting))
         return worker
 
     @property
@@ -150,6 +156,10 @@ class PerceptionProcess:
     def select(self, request: SelectRequest) -> None:
         """Send what to select; a `Selected` answers it."""
         self._put(request)
+
+    def change_detecting(self, detecting: Detecting) -> None:
+        """Send what to detect from the next frame on."""
+        self._put(detecting)
 
     def ask_to_stop(self) -> None:
         self._put(Stop())

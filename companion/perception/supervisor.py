@@ -25,6 +25,7 @@ from companion.perception.messages import (
     Attitude,
     CloudPreview,
     DepthPreview,
+    Detecting,
     Ended,
     GimbalAttitude,
     Heartbeat,
@@ -41,10 +42,11 @@ from companion.perception.messages import (
 from companion.perception.process import PerceptionProcess, RateLimiter, Watchdog
 from companion.perception.standard_input import STANDARD_INPUT, StandardInput
 from companion.perception.status import LiveTracks, PerceptionState, PerceptionStatus, StageTimes
-from companion.settings import Settings
+from companion.settings import DetectorSection, Settings
 from companion.vehicle.state import Vector3
 from vision.attitude import Quaternion
 from vision.camera_model import CameraCalibration
+from vision.object_detector import resolve_classes
 from vision.path_planner import PathRequest, PlannedPath
 from vision.pipeline import PerceptionResult
 from vision.tracking import TARGET_CLASS, Selected, SelectRequest, TrackEventKind
@@ -154,6 +156,7 @@ class PerceptionSupervisor:
         self._selecting: deque[asyncio.Future[Selected]] = deque()
         self._vehicle_limiter, self._gimbal_limiter = RateLimiter(), RateLimiter()
         self._path_limiter = RateLimiter()
+        self._detecting: Detecting | None = None
 
     async def start(self) -> None:
         """Start the worker; returns when its model is loaded and its source has given a frame.
@@ -222,6 +225,34 @@ class PerceptionSupervisor:
             self._watched = wanted
             if self._process is not None:
                 self._process.watch(wanted)
+
+    def check_detecting(self, section: DetectorSection) -> None:
+        """Raise ValueError if the loaded detector cannot have this confidence and these classes."""
+        ready = self._ready
+        if ready is None or ready.model is None:
+            raise ValueError(f"detector.classes and confidence: no model is loaded ({self._state.value})")
+        if section.confidence < ready.min_confidence:
+            raise ValueError(
+                f"detector.confidence: must be at least {ready.min_confidence:g}, for which the detector was "
+                f"loaded, got {section.confidence:g}"
+            )
+        wanted = section.classes or range(len(ready.class_names))
+        try:
+            ids = resolve_classes(tuple(wanted), ready.class_names)
+        except ValueError as error:
+            raise ValueError(f"detector.classes: {error}") from None
+        if ready.reportable_ids is not None and not set(ids) <= set(ready.reportable_ids):
+            loaded = ", ".join(ready.class_names[index] for index in ready.reportable_ids)
+            raise ValueError(
+                f"detector.classes: the detector was loaded for {loaded} alone: for others set it in the "
+                "file, and start the service again"
+            )
+
+    def change_detecting(self, section: DetectorSection) -> None:
+        """Set confidence and classes, which were checked, for this worker and each later one."""
+        self._detecting = Detecting(section.confidence, section.classes)
+        if self._process is not None:
+            self._process.change_detecting(self._detecting)
 
     async def select(self, request: SelectRequest) -> Selected:
         """Select an object in the worker's images, or end the selection. Never raises."""
@@ -424,7 +455,7 @@ class PerceptionSupervisor:
             self._first_sequence = 0 if self._newest is None else self._newest.sequence + 1
 
     async def _spawn(self) -> PerceptionProcess:
-        settings, begin = self._worker_settings(), (self._tracks.next_id, self._record_as)
+        settings, begin = self._worker_settings(), (self._tracks.next_id, self._record_as, self._detecting)
         if settings.source.uri != STANDARD_INPUT:
             return await PerceptionProcess.spawn(settings, asyncio.subprocess.DEVNULL, *begin)
         if self._input is None:
@@ -503,6 +534,8 @@ class PerceptionSupervisor:
         self._on_calibration(ready.calibration)
         self.send_hud(self._hud.lines, self._hud.highlight)
         process.watch(self._watched)
+        if self._detecting is not None:  # set while the process was started
+            process.change_detecting(self._detecting)
         if self._lost_s is not None:
             self._on_event("info", f"perception restored after {time.monotonic() - self._lost_s:.1f} s")
             self._lost_s = None

@@ -26,11 +26,13 @@ from companion.perception.assembly import (
     build_levelling,
     build_path_planning,
     build_pipeline,
+    change_detecting,
     load_detector,
 )
 from companion.perception.messages import (
     Attitude,
     Begin,
+    Detecting,
     Ended,
     GimbalAttitude,
     Heartbeat,
@@ -88,6 +90,7 @@ class ControlChannel:
         watched: which previews are wanted.
         selections: what to select, oldest first; the reader removes them.
         path_request: the newest, and when it was received.
+        detecting: what to detect from the next frame on; None: unchanged. The reader removes it.
     """
 
     def __init__(self, connection: socket.socket) -> None:
@@ -96,6 +99,7 @@ class ControlChannel:
         self.watched = Watched(False)
         self.selections: deque[SelectRequest] = deque()
         self.path_request: tuple[PathRequest, int] | None = None
+        self.detecting: Detecting | None = None
         self.telemetry = CameraTelemetry()
         self._connection = connection
         self._finished = threading.Event()
@@ -135,6 +139,8 @@ class ControlChannel:
             self.watched = message
         elif isinstance(message, PathRequest):
             self.path_request = (message, time.monotonic_ns())
+        elif isinstance(message, Detecting):
+            self.detecting = message
         elif isinstance(message, SelectRequest):
             self.selections.append(message)
         elif isinstance(message, Stop):
@@ -275,8 +281,9 @@ def _work(begin: Begin, control: ControlChannel, sender: ResultSender) -> Ended 
             recorder=perception,
             first_track_id=begin.first_track_id,
         )
+        control.detecting = control.detecting or begin.detecting
         try:
-            _run(pipeline, perception, control, sender)
+            _run(settings, pipeline, perception, control, sender)
         except EndOfStream:
             return Ended(True, "end of stream", pipeline.frames)
         except (SourceError, DetectionsError) as error:
@@ -376,10 +383,18 @@ def _ready(perception: Perception) -> Ready:
         calibration,
         detector.model_sha256,
         detector.rendered_only,
+        detector.min_confidence,
+        detector.reportable_ids,
     )
 
 
-def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, sender: ResultSender) -> None:
+def _run(
+    settings: Settings,
+    pipeline: Pipeline,
+    perception: Perception,
+    control: ControlChannel,
+    sender: ResultSender,
+) -> None:
     sent_s = time.monotonic()
     selection = pipeline.object_selection
 
@@ -406,6 +421,9 @@ def _run(pipeline: Pipeline, perception: Perception, control: ControlChannel, se
                 sender.put(Selected(False, why))
             else:
                 selection.request(request)
+        detecting, control.detecting = control.detecting, None
+        if detecting is not None and perception.detector is not None:
+            change_detecting(settings, detecting, perception.detector, pipeline.tracker)
         pipeline.step(HEARTBEAT_S, deliver)
         if time.monotonic() - sent_s >= HEARTBEAT_S:
             sender.put_newest(Heartbeat(pipeline.frames, pipeline.dropped, pipeline.frames_skipped))

@@ -3,7 +3,8 @@
 The types of the fields say how a value is written, so no type name of a file is ever looked up or imported.
 A finite float is written as Python's shortest text that reads back as the same double; NaN and infinities,
 which JSON lacks, are the texts "NaN", "Infinity" and "-Infinity". A value of a union of dataclasses has its
-class name under the key "type". A field with the metadata `recorded: False` is left out and gets its default.
+class name under the key "type". A field with the metadata `recorded: False` is left out and gets its default;
+one with `recorded: "if set"` is written unless it is None, and is no part of the layout.
 """
 
 from __future__ import annotations
@@ -179,14 +180,19 @@ def _dataclass(kind: Any) -> _Codec:
         if field.metadata.get("recorded", True)
     ]
     names = {name for name, _ in codecs}
+    added = {field.name for field in fields(kind) if field.metadata.get("recorded") == "if set"}
 
     def encode_fields(value: Any) -> dict[str, Any]:
-        return {name: codec.encode(getattr(value, name)) for name, codec in codecs}
+        return {
+            name: codec.encode(item)
+            for name, codec in codecs
+            if (item := getattr(value, name)) is not None or name not in added
+        }
 
     def decode_fields(data: Any) -> Any:
-        if data.keys() != names:
+        if not names - added <= data.keys() <= names:
             raise KeyError(f"expected the fields {', '.join(sorted(names))}, got {', '.join(sorted(data))}")
-        return make(**{name: codec.decode(data[name]) for name, codec in codecs})
+        return make(**{name: codec.decode(data[name]) for name, codec in codecs if name in data})
 
-    layout = ",".join(f"{name}:{codec.layout}" for name, codec in codecs)
+    layout = ",".join(f"{name}:{codec.layout}" for name, codec in codecs if name not in added)
     return _Codec(encode_fields, decode_fields, f"{{{layout}}}")

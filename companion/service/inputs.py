@@ -16,7 +16,14 @@ from companion.guidance.command import BuildContext, Command, GrammarError
 from companion.guidance.formation.neighbours import Neighbourhood, Neighbours
 from companion.guidance.gimbal.controller import GimbalMounting
 from companion.guidance.grammar import parse
-from companion.guidance.interface import Answer, CommandInput, CommandSource, GuidanceInput, StreamStatus
+from companion.guidance.interface import (
+    Answer,
+    ChangedLimits,
+    CommandInput,
+    CommandSource,
+    GuidanceInput,
+    StreamStatus,
+)
 from companion.guidance.objects.from_detections import StateHistory
 from companion.guidance.objects.from_markers import NO_MARKERS, LocalizedMarkers
 from companion.guidance.search_pattern import Footprint
@@ -54,7 +61,7 @@ class InputAssembler:
         steering: the camera whose targets behaviours get.
         history: the vehicle's states of the last few seconds.
         poses: the other vehicles. velocities: the messages on the topic `velocity`.
-        parameters: as in `GuidanceInput`.
+        parameters, limits: as in `GuidanceInput`.
     """
 
     def __init__(
@@ -68,6 +75,7 @@ class InputAssembler:
         self.poses = Neighbours(settings.vehicle.name, on_event)
         self.velocities = VelocitySenders()
         self.parameters = NOTHING_READ
+        self.limits: ChangedLimits | None = None
         self._alone = Neighbourhood(settings.vehicle.name)
         detecting = any(camera.settings.markers.dictionary is not None for camera in cameras)
         self._markers = MarkerTracker(cameras, on_event) if detecting else None
@@ -142,6 +150,7 @@ class InputAssembler:
             steering.objects.objects,
             () if markers is None else markers.objects(steering),
             () if markers is None else markers.objects_below(),
+            self.limits,
         )
 
     def discard_received(self, now_ns: int) -> None:

@@ -14,7 +14,7 @@ from companion.bus.topics import IMAGE
 from companion.guidance.grammar import json_schema
 from companion.perception.cameras import WorkerCamera
 from companion.perception.supervisor import PerceptionState
-from companion.settings import Settings
+from companion.service.live_settings import LiveSettings
 from vision.model_files import kept_models
 from vision.redaction import without_password
 
@@ -31,8 +31,8 @@ class Queries:
         status: returns the state of the service.
     """
 
-    def __init__(self, settings: Settings, status: Callable[[], StatusBody]) -> None:
-        self._settings, self._status = settings, status
+    def __init__(self, live: LiveSettings, status: Callable[[], StatusBody]) -> None:
+        self._live, self._status = live, status
         self._cameras: Sequence[WorkerCamera] = ()
         self._waiting: dict[str | None, list[asyncio.Future[bytes]]] = defaultdict(list)
 
@@ -62,7 +62,7 @@ class Queries:
         return self._status()
 
     async def _config(self) -> Any:
-        return without_secrets(self._settings.model_dump(mode="json"))
+        return without_secrets(self._live.now.model_dump(mode="json"))
 
     async def _models(self) -> ModelsBody:
         loaded: list[ModelBody] = []
@@ -84,7 +84,7 @@ class Queries:
         return {"loaded": loaded, "files": [path.name for path in files]}
 
     async def _commands(self) -> dict[str, Any]:
-        steering = next(camera for camera in self._cameras if camera.name == self._settings.guidance.camera)
+        steering = next(camera for camera in self._cameras if camera.name == self._live.now.guidance.camera)
         return json_schema(steering.class_names)
 
     def _image_of(self, camera: WorkerCamera) -> QueryHandler:

@@ -30,6 +30,7 @@ from companion.service.factory import clients_of, driver_of, gimbal_mounting, gu
 from companion.service.guidance_loop import GuidanceLoop
 from companion.service.health import Health
 from companion.service.inputs import InputAssembler
+from companion.service.live_settings import LiveSettings
 from companion.service.other_commanders import OtherCommanders
 from companion.service.parts import Parts
 from companion.service.publisher import Publisher, localization_of
@@ -70,8 +71,7 @@ class Service:
         ask: Ask | None = None,
         dropped_lines: Callable[[], int] = lambda: 0,
     ) -> None:
-        self.settings = settings
-        self._console, self._ask, self._dropped_lines = console, ask, dropped_lines
+        self.settings, self._console, self._ask, self._dropped_lines = settings, console, ask, dropped_lines
         log = EventLog(lambda event: self.bus.publish(topics.EVENTS, event), on_event)
         self.events, self._event = log.newest, log.add
         self.driver: Driver = driver_of(settings, lambda sent, data: self._tap.on_bytes(sent, data))
@@ -87,13 +87,15 @@ class Service:
         self.inputs = InputAssembler(settings, self.cameras, self._event)
         identity, now_ns = self.inputs.poses.source, time.monotonic_ns()
         self.others = OtherCommanders(settings.vehicle, identity, now_ns, self._event)
-        self._queries = Queries(settings, self.status)
+        self._live = LiveSettings(settings, self.driver, self.inputs, self.cameras, self._event)
+        self._queries = Queries(self._live, self.status)
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
             on_event=self._event,
             on_command=self.command,
             queries=self._queries.handlers(self.cameras),
+            on_settings=self._live.answer,
             views=tuple(settings.cameras),
             listeners=[
                 Listener(topics.POSE, self.inputs.poses.on_message),
@@ -206,6 +208,7 @@ class Service:
             bus=self.bus,
             others=self.others.status(self.driver.state, now_ns),
             dropped_lines=self._dropped_lines(),
+            changed_settings=self._live.changes(),
         )
 
     @property

@@ -120,6 +120,18 @@ def changed(settings: Settings, changes: Mapping[str, str]) -> Settings:
     return reading.settings()
 
 
+def with_values(settings: Settings, values: Mapping[str, Any], origin: str) -> Settings:
+    """Return the settings with known keys changed, dotted key → value as in the file.
+
+    Raises ConfigurationError; its lines end with the origin.
+    """
+    reading = _Reading()
+    reading.take_values(settings)
+    for key, value in values.items():
+        reading.take_value(key, value, origin)
+    return reading.settings()
+
+
 def to_toml(settings: Settings) -> str:
     """Format the settings as a TOML file with a comment on every key; `load_settings` reads it back."""
     paragraphs = [_table(section, getattr(settings, section)) for section in sections_of_file()]
@@ -186,6 +198,10 @@ class _Reading:
                 if words.startswith(f"{section}_"):
                     name = words.removeprefix(f"{section}_")
                     self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
+
+    def take_value(self, key: str, value: Any, origin: str) -> None:
+        table, _, name = key.rpartition(".")
+        self._take(table, name, value, origin)
 
     def take_text(self, key: str, text: str, origin: str) -> None:
         table, _, name = key.rpartition(".")

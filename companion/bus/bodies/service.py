@@ -284,6 +284,37 @@ class PartBody(TypedDict):
     """when it is tried again; null: all the time, or it needs no try"""
 
 
+SettingValue = float | list[str | int]
+
+
+class ChangedSettingBody(TypedDict):
+    """A setting that was changed since the start."""
+
+    key: str
+    """for example guidance.max_altitude_m"""
+    value: SettingValue
+    """now"""
+    file: SettingValue
+    """at the start, and after the next one"""
+
+
+class LiveSettingBody(TypedDict):
+    """One setting in the reply of `settings`."""
+
+    value: SettingValue
+    """now"""
+    file: SettingValue
+    """at the start, and after the next one"""
+    expected: str
+    """its values in words"""
+    minimum: float | None
+    """of its range"""
+    maximum: float | None
+    """of its range"""
+    narrower: Annotated[str, one_of("smaller", "larger")] | None
+    """values that are accepted while armed; null: all"""
+
+
 class StatusLogBody(TypedDict):
     """The log."""
 
@@ -314,6 +345,8 @@ class StatusBody(TypedDict):
     """guidance"""
     limits: StatusLimitsBody
     """where the vehicle may fly"""
+    changed_settings: list[ChangedSettingBody]
+    """that differ from the file"""
     perception: StatusCameraBody
     """the first camera"""
     cameras: dict[str, StatusCameraBody]

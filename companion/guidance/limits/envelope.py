@@ -138,6 +138,11 @@ class Envelope:
         self._neighbours: Sequence[Neighbour] = ()
         self._landing = False
         self.obstacle_constraints: tuple[tuple[float, float, float], ...] = ()
+        self._easing = False
+
+    def change_limits(self, limits: Limits) -> None:
+        """Use other limits. A sent velocity outside them is reduced with the maximum acceleration."""
+        self.limits, self._easing = limits, True
 
     def reset(self) -> None:
         """Forget the last setpoint: the next one starts from the measured velocity."""
@@ -220,7 +225,9 @@ class Envelope:
     def _limit_velocity(
         self, asked: Vector3, state: VehicleState, dt_s: float, reasons: list[str]
     ) -> Vector3:
-        limits = self.limits
+        before = self._velocity if self._easing else None
+        least = _Least(before, self.limits.max_acceleration_mps2 * dt_s)
+        limits = self._eased(least)
         parts = (
             (limits.max_horizontal_speed_mps, math.hypot(asked[0], asked[1]), "horizontal speed"),
             (limits.max_climb_mps, -asked[2], "climb"),
@@ -235,8 +242,22 @@ class Envelope:
         north, east, down = (value * scale for value in asked) if scale < 1.0 else asked
         velocity = self._slew((north, east, down), state, dt_s, reasons)
         # Last, so that the acceleration limit does not delay braking at a fence.
-        north, east, down = self._slow_at_fences(velocity, state, reasons)
+        north, east, down = self._slow_at_fences(velocity, state, reasons, least)
+        self._easing = least.acted
         return (*_shorten((north, east, 0.0), limits.max_horizontal_speed_mps)[:2], down)
+
+    def _eased(self, least: _Least) -> Limits:
+        """The limits of speed, above the changed ones where the sent velocity is still being reduced."""
+        limits = self.limits
+        if least.sent is None:
+            return limits
+        north, east, down = least.sent
+        return replace(
+            limits,
+            max_horizontal_speed_mps=least.of(limits.max_horizontal_speed_mps, math.hypot(north, east)),
+            max_climb_mps=least.of(limits.max_climb_mps, -down),
+            max_descend_mps=least.of(limits.max_descend_mps, down),
+        )
 
     def _limit_feed_forward(
         self, asked: Vector3, sent: Vector3, state: VehicleState, reasons: list[str]
@@ -271,19 +292,29 @@ class Envelope:
         """How much of a velocity fences, obstacles and neighbours remove, m/s."""
         return math.dist(velocity, self._slow_at_fences(velocity, state, []))
 
-    def _slow_at_fences(self, velocity: Vector3, state: VehicleState, reasons: list[str]) -> Vector3:
-        """Limit the velocity so that the vehicle stops before fences, altitude limits and neighbours."""
-        limits, altitude_m = self.limits, state.altitude_m
+    def _slow_at_fences(
+        self, velocity: Vector3, state: VehicleState, reasons: list[str], least: _Least | None = None
+    ) -> Vector3:
+        """Limit the velocity so that the vehicle stops before fences, altitude limits and neighbours.
+
+        `least`: what a changed limit of altitude or distance leaves of the sent velocity.
+        """
+        limits, altitude_m, least = self.limits, state.altitude_m, least or _Least(None, 0.0)
         if state.position_ned_m is None or altitude_m is None:
             return velocity
         constraints = self._separation_constraints(state.position_ned_m)
         velocity = self._keep_separation(velocity, constraints, reasons)
         north, east, down = velocity
-        if down < -self._towards_fence(limits.max_altitude_m - altitude_m):
-            down = -self._towards_fence(limits.max_altitude_m - altitude_m)
+        sent_north, sent_east, sent_down = least.sent or (0.0, 0.0, 0.0)
+        climb_mps = least.of(self._towards_fence(limits.max_altitude_m - altitude_m), -sent_down)
+        descend_mps = self._towards_fence(altitude_m - limits.min_altitude_m)
+        if not self._landing:
+            descend_mps = least.of(descend_mps, sent_down)
+        if down < -climb_mps:
+            down = -climb_mps
             reasons.append(f"altitude limited to {limits.max_altitude_m:g} m")
-        elif not self._landing and down > self._towards_fence(altitude_m - limits.min_altitude_m):
-            down = self._towards_fence(altitude_m - limits.min_altitude_m)
+        elif not self._landing and down > descend_mps:
+            down = descend_mps
             reasons.append(f"altitude kept above {limits.min_altitude_m:g} m")
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
@@ -291,8 +322,10 @@ class Envelope:
         # Distance from home is one more constraint of the same projection.
         circle: list[tuple[float, float, float]] = list(self.obstacle_constraints)
         if distance_m > 0.0:
+            outwards = (away[0] / distance_m, away[1] / distance_m)
             allowed_mps = self._towards_fence(limits.max_distance_m - distance_m)
-            circle.append((away[0] / distance_m, away[1] / distance_m, allowed_mps))
+            allowed_mps = least.of(allowed_mps, sent_north * outwards[0] + sent_east * outwards[1])
+            circle.append((*outwards, allowed_mps))
             if north * circle[-1][0] + east * circle[-1][1] > allowed_mps + 1e-9:
                 reasons.append(f"distance from home limited to {limits.max_distance_m:g} m")
         circle += level_constraints(constraints, down)
@@ -419,6 +452,25 @@ class Envelope:
         self._yaw_rad = wrap_angle(previous + math.copysign(limit * dt_s, turn))
         reasons.append(f"yaw rate limited to {limit:g} rad/s")
         return replace(setpoint, yaw_rad=self._yaw_rad)
+
+
+class _Least:
+    """What changed limits leave of a speed: that of the last setpoint, less the maximum acceleration's share.
+
+    Attributes:
+        sent: the last setpoint's velocity; None: no limit was changed, or nothing is sent.
+        acted: a speed is above its limit.
+    """
+
+    def __init__(self, sent: Vector3 | None, step_mps: float) -> None:
+        self.sent, self._step_mps, self.acted = sent, step_mps, False
+
+    def of(self, allowed_mps: float, sent_mps: float) -> float:
+        """The allowed speed, or a larger one that the sent speed may be reduced to in this step."""
+        if self.sent is None or sent_mps - self._step_mps <= allowed_mps:
+            return allowed_mps
+        self.acted = True
+        return sent_mps - self._step_mps
 
 
 def _shorten(vector: Vector3, longest: float) -> Vector3:
