@@ -265,15 +265,23 @@ def test_drawn_images_that_freeze_end_an_approach(fault: str, at_s: float) -> No
 
 
 @pytest.mark.parametrize("target", ["static", pytest.param("moving", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("fault", [EXACT, BELOW_A_CLOCK])
+@pytest.mark.parametrize(("fault", "steers"), [(EXACT, True), (BELOW_A_CLOCK, True), (BELOW_A_CLOCK, False)])
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
-def test_no_landing_sinks_on_with_a_frozen_camera(fault: str, target: str, seed: int) -> None:
+def test_no_landing_sinks_on_with_a_frozen_camera(fault: str, steers: bool, target: str, seed: int) -> None:
+    """Its camera is the one that steers, or another one that looks down."""
     rng = random.Random(seed)
     pad = flights_land.Pad((rng.uniform(-1.0, 1.0), rng.uniform(-1.0, 1.0)), rng.uniform(-3.0, 3.0))
     finder = flights_land.ProjectedCamera(pad, flights_land.MOUNT, np.random.default_rng(seed))
     settings = camera_settings(flights_land.CAMERA, flights_land.MOUNT, flights_land.MARKER_SETTINGS)
     camera = SyntheticCamera(settings, find_markers=finder.look, rate_hz=20.0)
     flight = LockstepFlight.of_vehicle(in_the_air(seed=3, height_m=8.0, wind_mps=1.0), camera=camera)
+    if not steers:
+        assemble = flight.inputs.assemble
+
+        def looking_down(*given: Any, **named: Any) -> GuidanceInput:
+            return replace(assemble(*given, **named), steering_markers=NO_MARKERS, marker_objects=())
+
+        flight.inputs.assemble = looking_down  # type: ignore[method-assign]
     freeze = Freeze(flight, fault, rng.uniform(3.0, 8.0)).fly(
         f"land-on-marker {flights_land.MIDDLE} target={target} attempts=1"
     )
