@@ -220,6 +220,29 @@ def test_fence_is_centred_on_home() -> None:
     assert known(sent.velocity_ned_mps)[0] == pytest.approx(3.0)
 
 
+def test_limits_of_a_position_are_from_home() -> None:
+    state = vehicle((250.0, 0.0, -44.0), home=(200.0, 0.0, 5.0))
+    asked = Setpoint.position((252.0, 0.0, -46.0), NOW)
+    sent, reasons = Envelope(LIMITS).apply(asked, state, NOW, 0.02)
+    assert sent.position_ned_m == pytest.approx((252.0, 0.0, 5.0 - LIMITS.max_altitude_m))
+    assert [reason.split()[0] for reason in reasons] == ["altitude"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "state", "limit"),
+    [
+        (Setpoint.position((50.0, 0.0, -10.0), NOW), vehicle(), "horizontal speed"),
+        (Setpoint.position((0.0, 0.0, -20.0), NOW), vehicle(), "climb"),
+        (Setpoint.position((0.0, 0.0, -5.0), NOW), vehicle(), "descent"),
+        (Setpoint.velocity((3.0, 0.0, 0.0), NOW), vehicle((200.0, 0.0, -10.0), (3.0, 0.0, 0.0)), "distance"),
+    ],
+    ids=["far", "above", "below", "away from home"],
+)
+def test_limit_that_acts_is_named(asked: Setpoint, state: VehicleState, limit: str) -> None:
+    (reason,) = Envelope(LIMITS).apply(asked, state, NOW, 0.02).reasons
+    assert reason.startswith(limit)
+
+
 def fast(acceleration_mps2: float) -> Limits:
     return Limits(max_horizontal_speed_mps=20.0, max_acceleration_mps2=acceleration_mps2, fence=within(50.0))
 
