@@ -17,6 +17,8 @@ from companion.guidance.core import Guidance, GuidanceOptions
 from companion.guidance.interface import EventKind, GuidanceInput
 from companion.guidance.limits.envelope import Envelope, Limits
 from companion.guidance.limits.obstacles import (
+    BRAKING_GAIN,
+    LATENCY_S,
     Constraint,
     ObstacleMemory,
     ObstacleRules,
@@ -30,7 +32,7 @@ from companion.vehicle.state import FlightMode, Vector3
 from tests.companion.guidance.guidance_harness import GuidanceHarness, known
 from tests.companion.guidance.kinematic_vehicle import KinematicVehicle
 from vision.camera_model import CameraModel, CameraMount
-from vision.obstacle_sectors import SECTORS, ObstacleSectors, obstacle_sectors
+from vision.obstacle_sectors import SECTOR_RAD, SECTORS, ObstacleSectors, obstacle_sectors
 from vision.path_planner import PlannedPath
 
 NAN, INF = math.nan, math.inf
@@ -100,6 +102,24 @@ def test_retreat_is_no_faster_than_the_horizontal_limit() -> None:
     still = Setpoint.velocity((0.0, 0.0, 0.0), vehicle.now_ns)
     sent = envelope.apply(still, vehicle.state, vehicle.now_ns, 0.05).sent
     assert sent.velocity_ned_mps == pytest.approx((-1.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("sector", [0, 9, 30, 54])
+def test_vehicle_too_fast_for_the_distance_brakes(sector: int) -> None:
+    """In every direction alike, and also outside the margin."""
+    north, east = math.cos(sector * SECTOR_RAD), math.sin(sector * SECTOR_RAD)
+    vehicle = KinematicVehicle(velocity=[north, east, 0.0])
+    near = sectors(vehicle.now_ns, {sector: 4.0})
+    nearest = ObstacleRules("auto", 2.0).constraints(context(near, vehicle=vehicle))[0]
+    allowed_mps = speed_towards(2.0, LATENCY_S)
+    assert allowed_mps < 1.0
+    assert nearest == pytest.approx((north, east, allowed_mps - BRAKING_GAIN * (1.0 - allowed_mps)))
+
+
+def test_obstacles_without_a_position_are_as_seen() -> None:
+    seen = context(sectors(1, {0: 4.0}, rest=NAN))
+    seen = replace(seen, state=replace(seen.state, position_ned_m=None))
+    assert ObstacleMemory().filled(seen, MARGIN_M) is seen
 
 
 def test_position_behind_an_obstacle_is_not_reached() -> None:
@@ -210,12 +230,13 @@ def test_wrong_velocity_estimate_does_not_pass_the_margin(error_mps: float) -> N
     assert 12.5 < vehicle.position[0] < 13.1
 
 
-def test_obstacle_outside_the_image_is_remembered() -> None:
+@pytest.mark.parametrize("left_m", [3.0, 0.5])
+def test_obstacle_outside_the_image_is_remembered(left_m: float) -> None:
     memory, vehicle = ObstacleMemory(), KinematicVehicle()
     memory.filled(context(sectors(vehicle.now_ns, {0: 4.0}, rest=NAN), vehicle=vehicle), MARGIN_M)
-    vehicle.position[0] += 1.0
+    vehicle.position[0] += 4.0 - left_m
     vehicle.now_ns += 10**9
-    assert ahead_m(memory, vehicle) == pytest.approx(3.0)
+    assert ahead_m(memory, vehicle) == pytest.approx(left_m)
     vehicle.now_ns += 10**10
     assert math.isnan(ahead_m(memory, vehicle))
 
