@@ -7,7 +7,7 @@ import math
 from random import Random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.guidance.formation.neighbours import Neighbour
@@ -71,6 +71,13 @@ constraints = st.lists(
 )
 
 
+def at_bearing(degrees: float, allowed_mps: float) -> SpeedConstraint:
+    bearing_rad = math.radians(degrees)
+    return SpeedConstraint(math.cos(bearing_rad), math.sin(bearing_rad), 0.0, allowed_mps, "x")
+
+
+# Between two neighbours the projections approach the allowed velocity slowly: it is scaled down at the end.
+@example((5.0, 0.0, 0.0), [at_bearing(85.0, 0.1), at_bearing(-85.0, 0.1)])
 @settings(max_examples=200)
 @given(velocity, constraints)
 def test_limited_velocity_satisfies_every_constraint(asked: Vector3, limits: list[SpeedConstraint]) -> None:
