@@ -68,6 +68,7 @@ WAYS = {
     "in the body frame": Way(
         "goto forward=10 right=2 heading=180", level((3, 15)), 0.5, (5.0, 5.0, -5.0), math.pi / 2
     ),
+    "in the body frame, aslant": Way("goto forward=6 right=8", level((0, 10)), 0.5, yaw_rad=math.atan2(3, 4)),
     "where it is": Way("goto forward=0 right=0", level((0, 0))),
     "one point, where it is": Way("follow-path 0,0", level((0, 0))),
     "steep, within the climb limit": Way("goto 30 0 altitude=35 speed=8", [(30, 0, -35)], 1.5),
