@@ -82,6 +82,7 @@ FOLLOWED = [
     (setpoint(velocity=(0.0, 0.3, 0.0)), reported(HERE, (1.0, 0.0, 0.0)), True),
     (setpoint(HERE), reported((6.0, -2.0, -6.0)), True),
     (setpoint(HERE), reported(velocity=(0.0, 0.0, 0.0)), True),
+    (setpoint(velocity=(1.0, 0.0, 0.0)), reported((NAN, NAN, -6.0), (1.0, 0.0, 0.0), 35), True),  # a height
     (setpoint(velocity=HERE), reported(HERE), True),  # the same numbers, of another kind
 ]
 
