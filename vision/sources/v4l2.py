@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vision.open_files import PROC, processes_with_file, program_name
+
 _QUERYCAP, _ENUM_FMT, _ENUM_FRAMESIZES, _ENUM_FRAMEINTERVALS = 0x80685600, 0xC0405602, 0xC02C564A, 0xC034564B
 _QUERYCTRL, _S_CTRL = 0xC0445624, 0xC008561C
 _CAPABILITY = struct.Struct("=16s32s32s6I")
@@ -245,25 +247,13 @@ def _control_range(descriptor: int, control: int, ioctl: Ioctl) -> tuple[int, in
     return None if flags & (_CTRL_DISABLED | _CTRL_READ_ONLY) else (least, most)
 
 
-def holders(device: Path, proc: Path = Path("/proc")) -> tuple[str, ...]:
+def holders(device: Path, proc: Path = PROC) -> tuple[str, ...]:
     """Programs that have a device open, `NAME (PID)`, without this process.
 
     Other users' programs are visible to root only.
     """
-    try:
-        wanted = device.resolve(strict=True)
-    except OSError:
-        return ()
-    found = []
-    for folder in sorted((p for p in proc.iterdir() if p.name.isdecimal()), key=lambda p: int(p.name)):
-        if int(folder.name) == os.getpid():
-            continue
-        try:
-            if any(Path(os.readlink(fd.path)) == wanted for fd in os.scandir(folder / "fd")):
-                found.append(f"{(folder / 'comm').read_text().strip()} ({folder.name})")
-        except OSError:  # it has ended, or belongs to another user
-            continue
-    return tuple(found)
+    found = processes_with_file(device, proc)
+    return tuple(f"{program_name(process, proc)} ({process})" for process in found)
 
 
 def fourcc_text(code: int) -> str:
