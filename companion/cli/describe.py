@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
@@ -107,13 +108,13 @@ def _describe_topics(schema: Path | None, *, as_json: bool, as_markdown: bool) -
 
 
 def _describe_settings(settings: Settings, *, check: bool) -> None:
-    from companion.settings.reading import ConfigurationError, to_toml
+    from companion.settings.reading import ConfigurationError, to_toml, unknown_variables
 
     if check:
         from companion.cli.config_check import check_settings
 
         with plain_errors(ConfigurationError):
-            for line in check_settings(settings):
+            for line in (*unknown_variables(os.environ).values(), *check_settings(settings)):
                 typer.echo(marked_for_journal(f"companion: {line}", logging.WARNING), err=True)
         return
     text = to_toml(settings)

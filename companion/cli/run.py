@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import gc
 import logging
+import os
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING
@@ -58,12 +59,14 @@ def run_service(settings: Settings, on_page: Callable[[str], None] = lambda _: N
         from companion.perception.supervisor import PerceptionStartError
         from companion.service import Service
         from companion.settings.plugins import PluginError
-        from companion.settings.reading import ConfigurationError
+        from companion.settings.reading import ConfigurationError, unknown_variables
         from companion.vehicle.driver import LinkError
 
     # A stalled reader of standard error must not block the service. Before any handler uses the stream.
     output = use_for_standard_error()
     log_to_standard_error(settings.log.level.upper(), "%(levelname)s %(name)s: %(message)s")
+    for line in unknown_variables(os.environ).values():
+        logging.getLogger("companion").warning("%s", line)
     wrong = (ConfigurationError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
     with plain_errors(*wrong):
         check_settings(settings)  # what is missing is reported by its part

@@ -37,11 +37,22 @@ from vision.file_kinds import explained
 from vision.redaction import redacted
 from vision.text_file import read_text
 
-__all__ = ["ConfigurationError", "Flag", "Settings", "default_path", "flags", "load_settings", "to_toml"]
+__all__ = [
+    "ConfigurationError",
+    "Flag",
+    "Settings",
+    "default_path",
+    "flags",
+    "load_settings",
+    "to_toml",
+    "unknown_variables",
+]
 
 DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
 # COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. No section's name begins with another's and `_`.
 ENVIRONMENT_PREFIX = "COMPANION_"
+# Other variables of this project, which no installed program reads.
+_NO_SETTINGS = ("COMPANION_TEST_", "COMPANION_SITL_")
 
 
 class ConfigurationError(ValueError):
@@ -109,6 +120,28 @@ def load_settings(
     for key, text in (overrides or {}).items():
         reading.take_text(key, text, "given as a flag")
     return reading.settings(read_uri)
+
+
+def unknown_variables(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return variable with our prefix that is no setting, and is ignored → one line with the nearest one.
+
+    One of a known section and an unknown key is an error of `load_settings`.
+    """
+    fields = fields_of_sections()
+    known = {_variable_of(section, name): None for section, names in fields.items() for name in names}
+    found = {}
+    for variable in sorted(environment):
+        word = variable.removeprefix(ENVIRONMENT_PREFIX)
+        if word == variable or variable.startswith(_NO_SETTINGS) or word.lower().partition("_")[0] in fields:
+            continue
+        close = difflib.get_close_matches(word.upper(), known, n=1, cutoff=0.6)
+        nearest = f"did you mean {ENVIRONMENT_PREFIX}{close[0]}?" if close else "it may be another program's"
+        found[variable] = f"{variable} is no setting and is ignored; {nearest}"
+    return found
+
+
+def _variable_of(section: str, name: str) -> str:
+    return f"{section}_{name}".upper()
 
 
 def changed(settings: Settings, changes: Mapping[str, str]) -> Settings:

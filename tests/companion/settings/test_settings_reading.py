@@ -19,6 +19,7 @@ from companion.settings.reading import (
     flags,
     load_settings,
     to_toml,
+    unknown_variables,
 )
 from vision.calibration_files.camera_info import read_camera_info, write_camera_info
 from vision.camera_model import CameraModel
@@ -243,6 +244,27 @@ def test_unknown_environment_variable_is_reported() -> None:
     assert line.startswith(f"unknown key {key} (")
     assert f" {variable})" in line
     assert line.endswith(" detector.confidence?")
+
+
+@pytest.mark.parametrize(
+    ("variable", "nearest"),
+    [
+        ("COMPANION_DETECTR__CONFIDENCE", "COMPANION_DETECTOR_CONFIDENCE?"),
+        ("COMPANION_VEHICEL_URL", "COMPANION_VEHICLE_URL?"),
+        ("COMPANION_HOME", "another program's"),
+    ],
+)
+def test_variable_of_no_section_is_named_and_not_refused(variable: str, nearest: str) -> None:
+    environment = {variable: "1"}
+    assert load_settings("/dev/null", environment=environment) == Settings()
+    (found,) = unknown_variables(environment).items()
+    assert found[0] == variable
+    assert found[1].endswith(nearest)
+
+
+def test_settings_and_variables_of_tests_are_no_unknown_ones() -> None:
+    known = ("COMPANION_DETECTOR_CONFIDENCE", "COMPANION_TEST_DATA", "COMPANION_SITL_URL", "PATH")
+    assert unknown_variables(dict.fromkeys(known, "1")) == {}
 
 
 def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
