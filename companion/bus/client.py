@@ -45,6 +45,10 @@ class NoAnswerError(TimeoutError):
     """No service answered. The message is one line."""
 
 
+class RefusedError(NoAnswerError):
+    """Something is there, and opens no session: TLS, a password, another program, a service that hangs."""
+
+
 def client_settings(settings: ZenohSection, connect: tuple[str, ...] = ()) -> ZenohSection:
     """Return the client settings to reach the service with these settings: by its router, or directly.
 
@@ -123,7 +127,9 @@ def _open(settings: ZenohSection, deadline: float) -> zenoh.Session:
             if time.monotonic() > deadline:
                 where = ", ".join(settings.connect) or "the local network"
                 missing = f"{no_node_text(where)} (--connect selects another endpoint)"
-                raise NoAnswerError(connection_fault(config) or missing) from error
+                if (why := connection_fault(config)) is not None:
+                    raise RefusedError(why) from error
+                raise NoAnswerError(missing) from error
         time.sleep(0.1)
 
 
