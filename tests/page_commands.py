@@ -37,6 +37,7 @@ KEPT = (
 AFTER_FLIGHT = ("companion log replay", "companion learn collect")  # the page ends the service before
 PRINTS = (  # without end
     "companion echo",
+    "companion status --watch",
     "companion detect shm://front --model none --level",
     "companion detect shm://front --model none --markers",
 )
@@ -50,7 +51,7 @@ QUESTION, ANSWER = "fly this? [y/N]", b"y\n"
 ASKS = 'companion ask "'
 COMMAND_S = 120.0
 ENDED = (0, 128 + signal.SIGINT)
-DIFFERS = "companion log replay"  # with exit code 1
+DIFFERS = ("companion log replay", "companion doctor")  # with exit code 1
 OTHERS = "tensorboard"  # not our program: how it ends is not ours to test
 
 

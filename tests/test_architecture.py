@@ -31,6 +31,7 @@ COMPANION_LAYERS = {
     "service": 7,
     "dashboard": 8,
     "camera_tools": 9,
+    "doctor": 9,
     "logs": 9,
     "models": 9,
     "simulation": 9,
@@ -43,6 +44,7 @@ COMPANION_LAYERS = {
 INTERFACES = (
     "companion.client",
     "companion.dashboard",
+    "companion.doctor",
     "companion.ground_station",
     "companion.language",
     "companion.mqtt",
@@ -86,6 +88,7 @@ PROGRAMS = (
 OPERATORS_PROGRAMS = (
     "companion.cli.ask",
     "companion.cli.client",
+    "companion.cli.doctor",
     "companion.cli.mcp",
     "companion.cli.ros2",
     "companion.client.drone",

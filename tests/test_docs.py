@@ -19,6 +19,7 @@ from companion.settings.fields import fields_of_sections
 from companion.settings.former import REMOVED, RENAMED
 from companion.settings.reading import flags
 from mavlink_sim.cli.main import app as simulator_app
+from tools import check_table
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [
@@ -97,6 +98,11 @@ def test_every_file_in_architecture_exists() -> None:
     roots = ("", "vision", "mavlink_sim", "companion", "companion/guidance")
     for name in names:
         assert any((ROOT / root / name).exists() for root in roots), f"docs/architecture.md: {name}"
+
+
+def test_table_of_checks_is_up_to_date() -> None:
+    page = check_table.FILE.read_text()
+    assert check_table.with_table(page) == page, "python -m tools.check_table"
 
 
 def test_flight_command_table_is_complete() -> None:

@@ -99,7 +99,13 @@ REPEATED = {"policies.md": ("companion play", "companion send")}
 # A page with one of these has the programs of `put_quick_programs`; the others, and SLOW, the installed ones.
 QUICK = ("companion play", "takeoff", "--camera")
 # What the reader has running beforehand: in place of an autopilot's SITL the simulated vehicle.
-RUNNING = {"sitl.md": ("mavlink-sim",)}
+RUNNING = {
+    "sitl.md": ("mavlink-sim",),
+    "troubleshooting.md": (
+        "mavlink-sim",
+        "companion run --source none --vehicle-url udpin://127.0.0.1:14540",
+    ),
+}
 # More than 40 s of processor time; or no command that runs nowhere else: test_options_of_sources has the
 # options of point-clouds.md, avoid.md its flight.
 SLOW = {"calibrate.md", "cameras.md", "models.md", "point-clouds.md", "record-and-replay.md", "train.md"}

@@ -20,6 +20,7 @@ from companion.cli.client import echo, known_commands, send
 from companion.cli.demo import demo
 from companion.cli.describe import describe
 from companion.cli.detect import DETECT_SETTINGS, detect
+from companion.cli.doctor import doctor, status
 from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, Command, CompanionCommands, settings_command
 from companion.cli.learn import learn
 from companion.cli.log import log
@@ -50,6 +51,8 @@ app.command(cls=Command)(demo)
 settings_command(app, *DETECT_SETTINGS, optional_values=("--markers",))(detect)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector", epilog=known_commands)(send)
 settings_command(app, *CLIENT_SETTINGS)(echo)
+settings_command(app, *CLIENT_SETTINGS)(status)
+settings_command(app)(doctor)
 settings_command(app, *ASK_SETTINGS)(ask)
 settings_command(app, *MCP_SETTINGS)(mcp)
 settings_command(app)(describe)

@@ -314,8 +314,8 @@ def settings_command(
     """Register a function as a command of `app` that takes `--config` and settings as flags.
 
     The function's first parameter, `settings`, receives the validated settings; `read_settings` instead of it
-    a function that reads them. Optional parameters are `given`, the flags that were set, key → text, and
-    `context`. All others are the command's own.
+    a function that reads them, and may raise ConfigurationError. Optional parameters are `given`, the flags
+    that were set, key → text, and `context`. All others are the command's own.
 
     Args:
         keys: the settings that are flags, by key (`vehicle.name`) or by section (`zenoh`); none: all.
@@ -369,14 +369,17 @@ def _given_settings(command: Callable[..., None], keys: tuple[str, ...]) -> Call
         with_lens = any(values.get(part) not in (None, False) for part in _WITH_LENS)
 
         def read_settings() -> Settings:
-            with plain_errors(ConfigurationError):
-                return load_settings(
-                    config_file, overrides, read_uri=values.get("source") if with_lens else None
-                )
+            return load_settings(config_file, overrides, read_uri=values.get("source") if with_lens else None)
 
         offered = {"given": overrides, "context": context}
         values |= {name: value for name, value in offered.items() if name in own.parameters}
-        command(read_settings if "read_settings" in own.parameters else read_settings(), **values)
+        if "read_settings" in own.parameters:
+            with plain_errors(ConfigurationError):
+                command(read_settings, **values)
+            return
+        with plain_errors(ConfigurationError):
+            settings = read_settings()
+        command(settings, **values)
 
     parameters = [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)

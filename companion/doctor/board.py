@@ -1,0 +1,196 @@
+"""Checks of the board: supply, temperature, clock, scheduler, disk."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import platform
+import re
+import resource
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from companion.doctor.check import Check, fault, ok, unknown, warning
+from companion.doctor.facts import CheckKind, Facts
+from companion.host.load import busy_text
+
+# `vcgencmd get_throttled`: now, and since the start.
+_PI_BITS = (
+    (0, "undervoltage"),
+    (1, "processor frequency capped"),
+    (2, "throttled"),
+    (3, "temperature limit"),
+)
+_SINCE_START = 16
+# Boards throttle from here on, a Raspberry Pi without a trip point for it.
+_HOT_C = 80.0
+# Where a driver has no limits. `passive` is none: it throttles on purpose, often far below.
+_LIMITS, _USUAL_LIMIT_C = ("hot", "critical"), 95.0
+_NEAR_C = 5.0
+_MB = 1_000_000
+_LEAST_FREE_MB = 500
+_TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
+_TIMEX_BYTES = 512  # more than struct timex has
+
+
+def _supply(facts: Facts) -> Iterator[Check]:
+    machine, name = facts.machine, "supply"
+    advice = "a supply of 5.1 V and 5 A (Pi 5) or a shorter, thicker cable"
+    for folder in sorted((machine.sys / "class" / "hwmon").glob("hwmon*")):
+        chip = machine.text("class", "hwmon", folder.name, "name")
+        if chip == "rpi_volt" and machine.text("class", "hwmon", folder.name, "in0_lcrit_alarm") == "1":
+            yield fault(name, "undervoltage: the supply falls below 4.63 V", advice)
+            return
+        if chip == "soctherm_oc":
+            counts = {each.name: _number(each) for each in sorted(folder.glob("oc*_event_cnt"))}
+            if any(counts.values()):
+                events = ", ".join(f"{key}: {count:.0f}" for key, count in counts.items() if count)
+                found = f"over-current throttling since the start ({events})"
+                yield warning(name, found, "a stronger supply, or a lower mode: sudo nvpmodel -q")
+                return
+    text = machine.output_of(("vcgencmd", "get_throttled"))
+    match = None if text is None else re.search(r"throttled=0x([0-9a-fA-F]+)", text)
+    if match is None:
+        return
+    bits = int(match[1], 16)
+    now = [words for bit, words in _PI_BITS if bits >> bit & 1]
+    before = [words for bit, words in _PI_BITS if bits >> (bit + _SINCE_START) & 1]
+    if now:
+        yield fault(name, f"now: {', '.join(now)}", advice)
+    elif before:
+        yield warning(name, f"since the start: {', '.join(before)}", advice)
+    else:
+        yield ok(name, "no undervoltage and no throttling since the start")
+
+
+def _temperature(facts: Facts) -> Iterator[Check]:
+    hottest: tuple[float, str, float] | None = None
+    for zone in sorted((facts.machine.sys / "class" / "thermal").glob("thermal_zone*")):
+        value = _number(zone / "temp")
+        if value is None or not -40_000 < value < 200_000:  # a sensor that is off
+            continue
+        limits = [
+            limit / 1000
+            for kind in zone.glob("trip_point_*_type")
+            if _text(kind) in _LIMITS
+            and (limit := _number(kind.with_name(kind.name.replace("_type", "_temp")))) is not None
+            and limit > 0
+        ]
+        limit_c = min(limits, default=_USUAL_LIMIT_C)
+        found = value / 1000, _text(zone / "type") or zone.name, limit_c
+        if hottest is None or found[0] - found[2] > hottest[0] - hottest[2]:
+            hottest = found
+    if hottest is None:
+        return
+    value_c, where, limit_c = hottest
+    text = f"{where}: {value_c:.0f} °C, its limit is {limit_c:.0f} °C"
+    if value_c >= min(_HOT_C, limit_c - _NEAR_C):
+        kind = fault if value_c >= limit_c - _NEAR_C else warning
+        yield kind("temperature", text, "cooling, or a smaller detector.image_size")
+    else:
+        yield ok("temperature", text)
+
+
+def synchronised() -> bool | None:
+    """Whether the kernel's clock is kept by NTP, PTP or GPS (adjtimex(2)); None: not known."""
+    try:
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES))
+    except (OSError, AttributeError):
+        return None
+    return None if state < 0 else state != _TIME_ERROR
+
+
+def _clock(facts: Facts) -> Iterator[Check]:
+    machine = facts.machine
+    now = time.strftime("%Y-%m-%d %H:%M", time.gmtime(machine.wall_s))
+    if machine.wall_s < machine.built_s - 86400:
+        signs = facts.settings.vehicle.signing_key_file is not None
+        yield (fault if signs else warning)(
+            "clock",
+            f"it is {now} UTC here, before this program was installed: names of recordings, TLS"
+            f"{' and MAVLink signing' if signs else ''} are wrong",
+            "sudo timedatectl set-ntp true with a network, a clock with a battery, or fake-hwclock",
+        )
+        return
+    kept = synchronised()
+    state = (
+        "not known whether it is synchronised"
+        if kept is None
+        else "synchronised"
+        if kept
+        else "not synchronised"
+    )
+    if kept is False and facts.settings.vehicle.signing_key_file is not None:
+        found = f"{now} UTC, {state}: a signed link refuses frames that are older than those before"
+        yield warning("clock", found, "sudo timedatectl set-ntp true")
+    else:
+        yield ok("clock", f"{now} UTC, {state}")
+
+
+def _scheduling(facts: Facts) -> Iterator[Check]:
+    release = platform.release()
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0] if hasattr(resource, "RLIMIT_RTPRIO") else 0
+    real_time = os.geteuid() == 0 or limit != 0
+    text = f"kernel {release}, real-time policy {'permitted' if real_time else 'not permitted'} here"
+    if busy := busy_text():
+        yield warning(
+            "scheduling",
+            f"{text}{busy}",
+            "CPUSchedulingPolicy=rr, docs/safety.md, Real-time policy; or fewer programs",
+        )
+    else:
+        yield ok("scheduling", text)
+
+
+def _disk(facts: Facts) -> Iterator[Check]:
+    directory = facts.settings.recording.directory
+    if directory:
+        folder = Path(directory).expanduser().absolute()
+        yield _space("recordings", folder, facts.settings.recording.max_total_mb)
+    yield _space("disk", facts.machine.log if facts.machine.log.exists() else Path("/"), None)
+
+
+def _space(name: str, folder: Path, planned_mb: int | None) -> Check:
+    there = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        free_mb = shutil.disk_usage(there).free / _MB
+        used_mb = 0.0
+        if planned_mb is not None and folder.is_dir():
+            used_mb = sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) / _MB
+    except OSError as error:
+        return unknown(name, f"{there}: {error.strerror}")
+    text = f"{free_mb / 1000:.1f} GB are free at {there}"
+    if free_mb < _LEAST_FREE_MB:
+        return fault(name, text, "sudo journalctl --vacuum-size=200M, and remove what is not needed")
+    if planned_mb is not None and used_mb + free_mb < planned_mb + _LEAST_FREE_MB:
+        most = max(int(used_mb + free_mb) - 2 * _LEAST_FREE_MB, 1)
+        found = f"{text}; recording.max_total_mb is {planned_mb}, of which {used_mb:.0f} are used"
+        return warning(name, found, f"recording.max_total_mb = {most}")
+    return ok(name, text)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace").strip("\0 \n")
+    except OSError:
+        return ""
+
+
+def _number(path: Path) -> float | None:
+    try:
+        return float(_text(path))
+    except ValueError:
+        return None
+
+
+CHECKS = (
+    CheckKind("supply", "undervoltage and throttling of a Raspberry Pi, over-current of a Jetson", _supply),
+    CheckKind("temperature", "a board near its limit", _temperature),
+    CheckKind("clock", "a clock before the installation, or not synchronised on a signed link", _clock),
+    CheckKind(
+        "scheduling", "a busy computer; the kernel, and whether a real-time policy is permitted", _scheduling
+    ),
+    CheckKind("disk", "little space for the journal, or less than `recording.max_total_mb`", _disk),
+)
