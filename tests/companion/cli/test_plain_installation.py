@@ -34,6 +34,8 @@ OPTIONAL = {
         "vision.training.",
         "vision.yolo.",
     ),
+    "aiomqtt": ("companion.mqtt.broker",),
+    "httpx": ("companion.mqtt.webhooks",),
     "mcap": (
         "companion.learning.collect",
         "companion.logs.",
