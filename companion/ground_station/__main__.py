@@ -32,6 +32,7 @@ from companion.ground_station.component import Message
 from companion.ground_station.feed import BusFeed
 from companion.ground_station.link import StationLink
 from companion.ground_station.objects import Objects
+from companion.ground_station.parameters import Parameter, Parameters, definition
 from companion.ground_station.positions import Positions
 from companion.ground_station.reports import ComputerStatus, StatusTexts
 from companion.ground_station.tracking import FLAGS, Tracking
@@ -78,6 +79,7 @@ async def _run(client: ChildClient) -> None:
     cameras[0].sources.append(_report_losses(feed, texts, client.say))
     for camera, about in zip(cameras, options["cameras"], strict=False):
         _track(feed, camera, about, texts, section)
+        _offer_parameters(feed, camera, about, texts, section)
     open_parts: set[str] = set()
 
     def on_open(part: str) -> None:
@@ -169,10 +171,6 @@ def _track(
     feed: BusFeed, camera: Camera, about: dict[str, Any], texts: StatusTexts, section: GroundStationSection
 ) -> None:
     """Add the tracking and the objects of a camera."""
-
-    def say(severity: int, text: str) -> None:
-        texts.add(severity, text, time.monotonic_ns())
-
     tracking = Tracking(
         about["word"],
         lambda: camera.component_id,
@@ -181,7 +179,7 @@ def _track(
         steers=about["steers"],
         follows=section.track_follows,
         send=feed.send_command,
-        say=say,
+        say=partial(_say, texts),
     )
     camera.flags |= FLAGS
     camera.sources += [tracking.due, Objects(tracking, target_relative=section.target_relative).due]
@@ -198,6 +196,44 @@ def _track(
     feed.subscribe(STATUS, None, on_status)
     feed.subscribe(DETECTIONS, camera.name, on_detections)
     feed.subscribe(COMMAND_STATE, None, on_command_state, _EVENTS_KEPT)
+
+
+def _offer_parameters(
+    feed: BusFeed, camera: Camera, about: dict[str, Any], texts: StatusTexts, section: GroundStationSection
+) -> None:
+    """Add the parameters of a camera, if it has any."""
+    if not about["detects"] and camera.name is not None:
+        return
+    parameters = Parameters(
+        camera.name,
+        camera.requests,
+        detects=about["detects"],
+        query=feed.set_settings,
+        say=partial(_say, texts),
+    )
+    camera.needs_definition = section.video_listen is not None
+    described: tuple[Parameter, ...] = ()
+
+    def due(now_ns: int) -> list[Message]:
+        nonlocal described
+        if parameters.are_complete and parameters.now != described:
+            described = parameters.now
+            camera.definition = definition(camera.label, described)
+        return parameters.due(now_ns)
+
+    def on_status(payload: bytes, _attachment: bytes | None) -> None:
+        parameters.on_status(cast("StatusBody", parse_object(payload)))
+
+    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
+        parameters.on_vehicle(cast("VehicleBody", parse_object(payload)), time.monotonic_ns())
+
+    camera.sources.append(due)
+    feed.subscribe(STATUS, None, on_status)
+    feed.subscribe(VEHICLE, None, on_vehicle)
+
+
+def _say(texts: StatusTexts, severity: int, text: str) -> None:
+    texts.add(severity, text, time.monotonic_ns())
 
 
 def _on_camera_info(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:

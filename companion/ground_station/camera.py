@@ -26,6 +26,8 @@ from companion.ground_station.positions import Place, Positions
 COMPONENT_IDS = range(mavlink.MAV_COMP_ID_CAMERA, mavlink.MAV_COMP_ID_CAMERA6 + 1)
 VENDOR = "companion"
 _HEARTBEAT_NS = 1_000_000_000
+DEFINITION_WAIT_NS = 20_000_000_000
+"""A service has loaded its model by then, or video is not to wait for it."""
 # `status` comes once a second.
 STATUS_MAX_AGE_NS = 3_000_000_000
 _UNKNOWN_I32, _NAN = 2**31 - 1, math.nan
@@ -82,8 +84,9 @@ class Camera:
         requests: what it answers; other parts add to it.
         sources: functions as `due`, of other parts that send as this component.
         flags: CAMERA_CAP_FLAGS of other parts.
-        streams: its video streams; their numbers count from 1. definition_uri, definition_version: of its
-            definition file; empty: none.
+        streams: its video streams; their numbers count from 1.
+        definition: its definition file and the version; None: there is none yet.
+        needs_definition: CAMERA_INFORMATION waits for `define`, for `DEFINITION_WAIT_NS` at most.
     """
 
     def __init__(
@@ -102,7 +105,10 @@ class Camera:
         self.sources: list[Callable[[int], Iterable[Message]]] = []
         self.flags = 0
         self.streams: Sequence[VideoStream] = ()
-        self.definition_uri, self.definition_version = "", 0
+        self.definition: tuple[bytes, int] | None = None
+        self.needs_definition = False
+        self._definition_uri, self._definition_version = "", 0
+        self._first_ns: int | None = None
         self._field_rad = field_rad
         self._info: CameraInfoBody | None = None
         self._status_ns: int | None = None
@@ -114,7 +120,7 @@ class Camera:
         self._announcements_ns: list[int] = []
         self._photos: dict[int, Message] = {}
         self.requests.replies |= {
-            mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION: lambda _: [self._information()],
+            mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION: lambda _: self._informations(),
             mavlink.MAVLINK_MSG_ID_CAMERA_SETTINGS: lambda _: [self._settings()],
             mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION: self._storage,
             mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS: lambda _: [self._capture_status()],
@@ -147,6 +153,11 @@ class Camera:
         self._info = info
         self._is_changed |= changed
 
+    def define(self, uri: str, version: int) -> None:
+        """Announce where its definition file is; empty: nowhere. Stations that asked before get it too."""
+        self._definition_uri, self._definition_version = uri, version
+        self.needs_definition, self._is_changed = False, True
+
     # --- the component -------------------------------------------------------------------------------
 
     def handle(self, message: Message, now_ns: int) -> Iterable[Message]:
@@ -174,11 +185,15 @@ class Camera:
     def due(self, now_ns: int) -> Iterable[Message]:
         """See Component."""
         self._now_ns = now_ns
+        if self._first_ns is None:
+            self._first_ns = now_ns
+        if self.needs_definition and now_ns - self._first_ns > DEFINITION_WAIT_NS:
+            self.needs_definition, self._is_changed = False, True
         if self._heartbeat_ns is None or now_ns - self._heartbeat_ns >= _HEARTBEAT_NS:
             late = self._heartbeat_ns is None or now_ns - self._heartbeat_ns >= 2 * _HEARTBEAT_NS
             self._heartbeat_ns = now_ns if late else (self._heartbeat_ns or 0) + _HEARTBEAT_NS
             yield self._heartbeat()
-        if self._is_changed:
+        if self._is_changed and not self.needs_definition:
             self._is_changed = False
             yield self._information()
         if self._announcements_ns and now_ns >= self._announcements_ns[0]:
@@ -234,6 +249,10 @@ class Camera:
             mavlink.MAV_TYPE_CAMERA, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, self._state, 3
         )
 
+    def _informations(self) -> Sequence[Message]:
+        """QGroundControl reads the address of a definition once, and asks again while there is no message."""
+        return [] if self.needs_definition else [self._information()]
+
     def _information(self) -> Message:
         width, height = self.size
         has_stream = mavlink.CAMERA_CAP_FLAGS_HAS_VIDEO_STREAM if self.streams else 0
@@ -249,8 +268,8 @@ class Camera:
             height,
             0,
             _CAPTURES | has_stream | self.flags,
-            self.definition_version,
-            _text(self.definition_uri, 140),
+            self._definition_version,
+            _text(self._definition_uri, 140),
         )
 
     def _settings(self) -> Message:

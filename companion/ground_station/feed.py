@@ -12,12 +12,21 @@ from typing import Any
 import zenoh
 
 from companion.bus.child_client import ChildClient
-from companion.bus.client import NoAnswerError, message_of, send_command, subscribe_kept
+from companion.bus.client import (
+    NoAnswerError,
+    SettingsRefusedError,
+    message_of,
+    send_command,
+    set_settings,
+    subscribe_kept,
+)
 from companion.bus.topics import IMAGE, Topic
 from companion.host.peer_data import PeerDataError, parse_object
 
 OnMessage = Callable[[bytes, bytes | None], None]
 """Called in the loop with payload and attachment."""
+OnReply = Callable[[Mapping[str, Any]], None]
+"""Called in the loop with a reply: `success`, and `reason` where there is none."""
 OnImage = Callable[[bytes, int], None]
 """Called in the loop with a JPEG and its `captured_ns`."""
 
@@ -58,22 +67,40 @@ class BusFeed:
         if bool(users) != before:
             self._changes.put((camera, bool(users)))
 
-    def send_command(self, text: str, on_reply: Callable[[Mapping[str, Any]], None]) -> None:
+    def send_command(self, text: str, on_reply: OnReply) -> None:
         """Send a command to the service, and call back in the loop with its reply or why there is none."""
+        self._ask(lambda session: send_command(session, self._vehicle, text, timeout_s=_ANSWER_S), on_reply)
+
+    def set_settings(self, values: Mapping[str, Any] | None, on_reply: OnReply) -> None:
+        """Set settings of the service (None: ask for them), and call back in the loop.
+
+        The reply has `settings`, key → LiveSettingBody, or `reason` and whether the service has `refused`.
+        """
+
+        def ask(session: zenoh.Session) -> Mapping[str, Any]:
+            given = None if values is None else dict(values)
+            settings = set_settings(session, self._vehicle, given, timeout_s=_ANSWER_S)
+            return {"success": True, "settings": settings}
+
+        self._ask(ask, on_reply)
+
+    def _ask(self, ask: Callable[[zenoh.Session], Mapping[str, Any]], on_reply: OnReply) -> None:
+        """Ask the service in a thread, and call back in the loop."""
         if (session := self._session) is None:
-            refused = {"success": False, "reason": "the service is not reached"}
-            self._loop.call_soon(on_reply, refused)
+            unreached = {"success": False, "refused": False, "reason": "the service is not reached"}
+            self._loop.call_soon(on_reply, unreached)
             return
 
         def run() -> None:
             try:
-                reply = send_command(session, self._vehicle, text, timeout_s=_ANSWER_S)
-            except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
-                reply = {"success": False, "reason": str(error)}
+                reply = ask(session)
+            except (SettingsRefusedError, NoAnswerError, PeerDataError, zenoh.ZError) as error:
+                refused = isinstance(error, SettingsRefusedError)
+                reply = {"success": False, "refused": refused, "reason": str(error)}
             if not self._loop.is_closed():
                 self._loop.call_soon_threadsafe(on_reply, reply)
 
-        Thread(target=run, name="command", daemon=True).start()
+        Thread(target=run, name="query", daemon=True).start()
 
     def run(self, on_open: Callable[[], None]) -> None:
         """Open the bus, however late it comes, and keep the subscriptions until the end. In a thread."""

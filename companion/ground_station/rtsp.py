@@ -115,7 +115,7 @@ class VideoServer:
                 "ground_station.video_token_file must be set"
             )
         self.viewers: dict[str, set[_Viewer]] = {stream: set() for stream in streams}
-        self.documents = documents or {}
+        self.documents = {} if documents is None else documents
         self._token, self._on_wanted, self._say = token, on_wanted, say
         self._wanted: set[str] = set()
         self._refused: dict[str, str] = {}

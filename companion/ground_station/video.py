@@ -18,6 +18,9 @@ from companion.settings.key_files import KeyFileError, read_token
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 
+LONGEST_DEFINITION_URI_BYTES = 139
+"""Of CAMERA_INFORMATION, with a zero at its end."""
+
 
 @asynccontextmanager
 async def serving_video(
@@ -46,13 +49,19 @@ async def serving_video(
     if len(streams) < len(cameras):
         raise GroundStationError("a camera's name is `camera`, as the video of the first one: rename it")
 
+    documents: dict[str, tuple[str, bytes]] = {}
     pushes: dict[str, Callable[[str, bytes, int], None]] = {}
 
     def want(kind: str, stream: str, wanted: bool) -> None:
         feed.want_images(streams[stream].name, kind, partial(pushes[kind], stream) if wanted else None)
 
     jpeg = VideoServer(
-        section.video_listen, streams, token=token, on_wanted=partial(want, "RTP/JPEG"), say=say
+        section.video_listen,
+        streams,
+        token=token,
+        documents=documents,
+        on_wanted=partial(want, "RTP/JPEG"),
+        say=say,
     )
     await jpeg.start()
     h264 = H264Server(
@@ -67,6 +76,26 @@ async def serving_video(
     url = parse_link_url(section.url)
     known = url.scheme in (LinkScheme.UDP_OUT, LinkScheme.TCP)
     host = announced_host(jpeg.host, section.video_host, url.address[0] if known else "")
+
+    def define(stream: str, camera: Camera, _now_ns: int) -> list[Message]:
+        if camera.definition is None:
+            return []
+        content, version = camera.definition
+        path = f"/{stream}.xml"
+        if documents.get(path, ("", b""))[1] == content:
+            return []
+        documents[path] = "application/xml", content
+        uri = f"http://{host}:{jpeg.port}{jpeg.with_token(path)}"
+        if len(uri.encode()) <= LONGEST_DEFINITION_URI_BYTES:
+            camera.define(uri, version)
+        elif camera.needs_definition:
+            camera.define("", 0)
+            say(
+                f"parameters of camera {camera.label} are not announced: the address of their definition has "
+                f"{len(uri.encode())} bytes, and CAMERA_INFORMATION carries {LONGEST_DEFINITION_URI_BYTES}: "
+                "a shorter ground_station.video_host, camera name or token is needed"
+            )
+        return []
 
     def announce(stream: str, camera: Camera, _now_ns: int = 0) -> list[Message]:
         width = min(camera.size[0], image_width)
@@ -84,7 +113,7 @@ async def serving_video(
     try:
         for stream, camera in streams.items():
             announce(stream, camera)
-            camera.sources.append(partial(announce, stream, camera))
+            camera.sources += [partial(announce, stream, camera), partial(define, stream, camera)]
         await h264.start()
         yield
     finally:

@@ -158,6 +158,7 @@ def _ground_station_options(settings: Settings) -> dict[str, Any]:
                 "word": name or FIRST_CAMERA,
                 "steers": name == settings.guidance.camera,
                 "max_age_s": camera.tracker.max_age_s,
+                "detects": camera.detector.enabled,
             }
             for name, camera in cameras.items()
         ],
