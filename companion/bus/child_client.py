@@ -10,7 +10,7 @@ import asyncio
 import json
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from threading import Event, Thread
 from typing import Any
@@ -76,23 +76,17 @@ def open_patiently(
     Args:
         missing: why there is none, for people; empty: as `open_client` says it.
     """
-    said = False
-    while not ending.is_set():
-        opening = open_client(section, timeout_s=0.0)
-        try:
-            session = opening.__enter__()
-        except NoAnswerError as error:
-            if not said:
-                say(f"{PAUSED}{missing or error}; retrying")
-            said = True
-            ending.wait(_RETRY_S)
-            continue
-        try:
-            yield session
-        finally:
-            opening.__exit__(None, None, None)
-        return
-    yield None
+    session, said = None, False
+    with ExitStack() as stack:
+        while session is None and not ending.is_set():
+            try:
+                session = stack.enter_context(open_client(section, timeout_s=0.0))
+            except NoAnswerError as error:
+                if not said:
+                    say(f"{PAUSED}{missing or error}; retrying")
+                said = True
+                ending.wait(_RETRY_S)
+        yield session
 
 
 def run_child(work: Callable[[ChildClient], None], refused: tuple[type[Exception], ...] = ()) -> int:
@@ -106,6 +100,7 @@ def run_child(work: Callable[[ChildClient], None], refused: tuple[type[Exception
     options = json.loads(read_options())
     client = ChildClient(settings_in_child(options.pop("zenoh")), options)
     on_parent_end(client.ending.set)
+    refused = (BusError, *refused)
     try:
         work(client)
     except ModuleNotFoundError as error:
@@ -114,9 +109,6 @@ def run_child(work: Callable[[ChildClient], None], refused: tuple[type[Exception
     except (PassingError, NoAnswerError) as error:  # or the node has gone since
         client.say(str(error))
         return EXIT_PASSING
-    except BusError as error:
-        client.say(str(error))
-        return EXIT_REFUSED
     except refused as error:
         client.say(str(error))
         return EXIT_REFUSED

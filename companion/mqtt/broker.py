@@ -27,6 +27,8 @@ MOST_EVENTS = 200
 LARGEST_COMMAND_BYTES = 4096
 _KEEPALIVE_S = 15
 _ANSWER_S = 10.0
+_AT_ONCE = 10  # states, and events: over a slow network each takes its time to be acknowledged
+_REFUSED = 0x80  # MQTT 3.1.1, 3.9.3
 _PORTS = {"mqtt": 1883, "mqtts": 8883}
 
 
@@ -104,6 +106,7 @@ class BrokerLink:
         self._states: dict[str, bytes] = {}  # all that are retained, for a broker that has lost them
         self._unsent: dict[str, None] = {}
         self._events: deque[tuple[str, bytes]] = deque()
+        self._sending: list[tuple[str, bytes]] = []
         self._connected = False
         self._left_out = 0
         self._waiting = asyncio.Event()
@@ -140,8 +143,9 @@ class BrokerLink:
                 if why != said:
                     self._say(f"{PAUSED}MQTT broker {self._broker}: {why}; retrying")
                 said = why
-            self._left_out += len(self._events)
+            self._left_out += len(self._events) + len(self._sending)
             self._events.clear()
+            self._sending.clear()
             await asyncio.sleep(restarts.after(loop.time() - since_s).pause_s)
 
     @asynccontextmanager
@@ -158,6 +162,7 @@ class BrokerLink:
             tls_context=broker.tls,
             max_queued_incoming_messages=MOST_EVENTS,
         )
+        client.pending_calls_threshold = 2 * _AT_ONCE
         async with client:
             self._unsent = dict.fromkeys(self._states)
             self._connected = True
@@ -176,7 +181,9 @@ class BrokerLink:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._send(client))
             if self._command is not None:
-                await client.subscribe(self._command, qos=0)  # a command is never delivered twice
+                (granted,) = await client.subscribe(self._command, qos=0)  # never delivered twice
+                if getattr(granted, "value", granted) >= _REFUSED:
+                    self._say(f"commands: the broker does not let its user subscribe to {self._command}")
             async for message in client.messages:
                 payload = message.payload
                 if message.retain or not isinstance(payload, bytes) or len(payload) > LARGEST_COMMAND_BYTES:
@@ -189,12 +196,15 @@ class BrokerLink:
             await self._waiting.wait()
             self._waiting.clear()
             while self._unsent or self._events:
-                if self._unsent:
-                    topic = next(iter(self._unsent))
+                states = list(self._unsent)[:_AT_ONCE]
+                for topic in states:
                     del self._unsent[topic]
-                    await client.publish(topic, self._states[topic], qos=1, retain=True)
-                if self._events:
-                    await client.publish(*self._events.popleft(), qos=1)
+                self._sending = [self._events.popleft() for _ in range(min(len(self._events), _AT_ONCE))]
+                await asyncio.gather(
+                    *(client.publish(topic, self._states[topic], qos=1, retain=True) for topic in states),
+                    *(client.publish(topic, payload, qos=1) for topic, payload in self._sending),
+                )
+                self._sending.clear()
 
     def _losses(self) -> str:
         count, self._left_out = self._left_out, 0

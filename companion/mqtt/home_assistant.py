@@ -27,41 +27,33 @@ def discovery(vehicle: str, base: str, cameras: tuple[str | None, ...], version:
     def entity(platform: str, key: str, name: str, **more: Any) -> dict[str, Any]:
         return {"platform": platform, "unique_id": f"companion_{_id(vehicle)}_{key}", "name": name, **more}
 
-    def value(platform: str, key: str, name: str, **more: Any) -> dict[str, Any]:
+    def sensor(key: str, name: str, platform: str = "sensor", **more: Any) -> dict[str, Any]:
         template = f"{{{{ value_json.{key} }}}}"
-        if platform == "binary_sensor":
-            template = f"{{{{ 'ON' if value_json.{key} else 'OFF' }}}}"
         return entity(platform, key, name, state_topic=state, value_template=template, **more)
 
+    def flag(key: str, name: str, **more: Any) -> dict[str, Any]:
+        return sensor(key, name, "binary_sensor", payload_on="True", payload_off="False", **more)
+
     def measure(key: str, name: str, unit: str, **more: Any) -> dict[str, Any]:
-        return value("sensor", key, name, unit_of_measurement=unit, state_class="measurement", **more)
+        return sensor(key, name, unit_of_measurement=unit, state_class="measurement", **more)
 
     entities = {
-        "problem": value("binary_sensor", "problem", "Problem", device_class="problem"),
-        "connected": value("binary_sensor", "connected", "Autopilot", device_class="connectivity"),
-        "armed": value("binary_sensor", "armed", "Armed"),
-        "mode": value("sensor", "mode", "Mode"),
-        "behaviour": value("sensor", "behaviour", "Behaviour"),
+        "problem": flag("problem", "Problem", device_class="problem"),
+        "connected": flag("connected", "Autopilot", device_class="connectivity"),
+        "armed": flag("armed", "Armed"),
+        "mode": sensor("mode", "Mode"),
+        "behaviour": sensor("behaviour", "Behaviour"),
         "battery": measure("battery_percent", "Battery", "%", device_class="battery"),
         "altitude": measure("altitude_m", "Altitude", "m", device_class="distance"),
         "objects": measure("objects", "Objects", "objects"),
         "place": entity("device_tracker", "place", "Place", json_attributes_topic=f"{base}/place"),
-        "event": entity(
-            "event",
-            "event",
-            "Object",
-            state_topic=f"{base}/objects",
-            event_types=list(EVENT_KINDS),
-            # An event needs its type under this name, and has the rest as attributes.
-            value_template="{{ {'event_type': value_json.event, **value_json} | tojson }}",
-        ),
+        # Without a template: it takes `event_type`, and has the rest as attributes.
+        "event": entity("event", "event", "Object", state_topic=f"{base}/objects", event_types=EVENT_KINDS),
     }
     for camera in cameras:
-        path = snapshot_path(camera)
-        name = "Snapshot" if camera is None else f"Snapshot {camera}"
-        entities[path.replace("/", "_")] = entity(
-            "camera", path.replace("/", "_"), name, topic=f"{base}/{path}"
-        )
+        path, name = snapshot_path(camera), "Snapshot" if camera is None else f"Snapshot {camera}"
+        key = path.replace("/", "_")
+        entities[key] = entity("camera", key, name, topic=f"{base}/{path}")
     return {
         "device": {"identifiers": [f"companion_{_id(vehicle)}"], "name": vehicle, "model": "companion"},
         "origin": {"name": "companion", "sw_version": version},

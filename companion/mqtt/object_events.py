@@ -47,7 +47,7 @@ class ObjectEvent:
     def body(self, *, with_snapshot: bool) -> dict[str, Any]:
         """Return the body of a message, with the snapshot as base64 where asked for."""
         image = {} if self.snapshot is None else {"snapshot": base64.b64encode(self.snapshot).decode()}
-        return {"event": self.kind, **self.about, **(image if with_snapshot else {})}
+        return {"event_type": self.kind, **self.about, **(image if with_snapshot else {})}
 
 
 class ObjectEvents:

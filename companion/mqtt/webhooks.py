@@ -12,7 +12,7 @@ import httpx
 
 from vision.redaction import redacted
 
-MOST_EVENTS = 100
+MOST_EVENTS, MOST_BYTES = 100, 16 * 1024 * 1024
 _TIMEOUT_S = 10.0
 _PAUSES_S = (1.0, 5.0, 25.0)
 _SAY_INTERVAL_S = 10.0
@@ -38,7 +38,7 @@ class Webhook:
     def put(self, event_id: str, body: bytes) -> None:
         """Post an event as soon as possible."""
         self._events.append((event_id, body))
-        while len(self._events) > MOST_EVENTS:
+        while len(self._events) > MOST_EVENTS or sum(len(each) for _, each in self._events) > MOST_BYTES:
             self._events.popleft()
             self._lose("it answers too slowly")
         self._waiting.set()

@@ -7,8 +7,9 @@ import os
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Awaitable, Callable
-from contextlib import AsyncExitStack, ExitStack
+from contextlib import AsyncExitStack, ExitStack, suppress
 from pathlib import Path
 
 import aiomqtt
@@ -167,6 +168,53 @@ def test_a_retained_or_large_message_is_no_command(tmp_path: Path) -> None:
 
         asyncio.run(retain())
         with_link(work, port)
+
+
+def test_a_refused_subscription_is_said_by_its_topic() -> None:
+    port = free_port(socket.SOCK_STREAM)
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while head := await reader.read(2):  # type and length, of packets below 128 bytes
+            body = await reader.readexactly(head[1])
+            if head[0] == 0x10:  # CONNECT
+                writer.write(b"\x20\x02\x00\x00")
+            if head[0] == 0x82:  # SUBSCRIBE
+                writer.write(b"\x90\x03" + body[:2] + b"\x80")
+
+    async def work(_: BrokerLink, said: Said, __: list[str]) -> None:
+        async with await asyncio.start_server(serve, "127.0.0.1", port):
+            assert COMMAND in await said.wait("commands: ")
+
+    with_link(work, port)
+
+
+def test_a_slow_network_is_used_by_several_messages_at_once(tmp_path: Path) -> None:
+    port, far = free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM)
+
+    async def forward(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        loop = asyncio.get_running_loop()
+        while data := await reader.read(65536):
+            loop.call_later(0.1, writer.write, data)
+
+    async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        far_reader, far_writer = await asyncio.open_connection("127.0.0.1", port)
+        with suppress(OSError):
+            await asyncio.gather(forward(reader, far_writer), forward(far_reader, writer))
+
+    async def work(link: BrokerLink, said: Said, _: list[str]) -> None:
+        async with await asyncio.start_server(serve, "127.0.0.1", far):
+            await said.wait("open mqtt://")
+            async with station(port) as client:
+                await client.subscribe(EVENTS)
+                begun_s = time.monotonic()
+                for number in range(100):
+                    link.event(EVENTS, str(number).encode())
+                received = [(await next_of(client, EVENTS))[0] for _ in range(100)]
+            assert received == [str(number) for number in range(100)]
+            assert time.monotonic() - begun_s < 10.0  # one after another: 20 s
+
+    with mosquitto.broker(port, tmp_path):
+        with_link(work, far)
 
 
 CERTIFICATE = (

@@ -5,8 +5,11 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+import re
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,10 +19,15 @@ import aiomqtt
 import pytest
 import zenoh
 
+from companion.bus.client import settings_for_child
 from companion.bus.topics import IMAGE, TRACKS
+from companion.host.child_process import EXIT_REFUSED
+from companion.mqtt.home_assistant import EVENT_KINDS
+from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
 from tests.companion.mqtt import mosquitto
 from tests.companion.service_process import ServiceProcess, heartbeats, running_service
+from vision.extras import install_command
 
 pytestmark = [pytest.mark.realtime, pytest.mark.needs("mosquitto")]
 
@@ -44,8 +52,8 @@ class Station:
                     return message.payload
         raise AssertionError
 
-    async def send(self, text: str) -> None:
-        await self._client.publish(f"{BASE}/command", text)
+    async def send(self, text: str, topic: str = "command", *, retain: bool = False) -> None:
+        await self._client.publish(f"{BASE}/{topic}", text, retain=retain)
 
 
 @pytest.fixture
@@ -118,7 +126,7 @@ def test_a_station_sees_the_vehicle_its_objects_and_its_end(service: ServiceProc
             event = json.loads(await station.wait(f"{BASE}/objects"))
             session.put(TRACKS.key("vehicle1"), tracks("end"))
             ended = json.loads(await station.wait(f"{BASE}/objects"))
-        assert (event["event"], event["class"], ended["event"]) == ("new", "cat", "end")
+        assert (event["event_type"], event["class"], ended["event_type"]) == ("new", "cat", "end")
         jpegs = [payload for topic, payload in station.received if topic == f"{BASE}/snapshot"]
         assert [jpeg[:2] for jpeg in jpegs] == [b"\xff\xd8"]
         # Not allowed: it is answered by nobody, and said by nobody.
@@ -145,13 +153,53 @@ def test_discovery_names_only_topics_and_values_that_come(service: ServiceProces
         assert len({entity["unique_id"] for entity in entities}) == len(entities)
         of_state = [entity for entity in entities if entity.get("state_topic") == f"{BASE}/state"]
         assert len(of_state) >= 8
-        for entity in of_state:
-            key = entity["value_template"].split("value_json.")[1].split()[0]
-            assert key in state
+        keys = [re.fullmatch(r"\{\{ value_json\.(\w+) \}\}", entity["value_template"]) for entity in of_state]
+        assert {key and key[1] for key in keys} <= set(state)
+        (of_objects,) = (entity for entity in entities if entity["platform"] == "event")
+        assert of_objects["event_types"] == list(EVENT_KINDS)
+        assert "value_template" not in of_objects  # its messages have `event_type` as they are
         others = {entity.get("state_topic") or entity.get("topic") for entity in entities} - {None}
         assert others == {f"{BASE}/state", f"{BASE}/objects", f"{BASE}/snapshot"}
 
     with_station(port, work)
+
+
+def test_the_will_of_an_older_connection_does_not_last(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        await station.wait(f"{BASE}/available", b"online")
+        await station.send("offline", "available", retain=True)
+        await station.wait(f"{BASE}/available", b"offline")
+        await station.wait(f"{BASE}/available", b"online")
+
+    with_station(port, work)
+
+
+def test_a_message_of_another_shape_is_said_and_ends_nothing(service: ServiceProcess, port: int) -> None:
+    async def work(station: Station) -> None:
+        await station.wait(f"{BASE}/available", b"online")
+        with service.client() as session:
+            await asyncio.to_thread(put_until_somebody_listens, session, "new")
+            session.put(TRACKS.key("vehicle1"), b'{"camera": null, "events": [{"event": "end"}]}')
+            await asyncio.to_thread(service.wait_for_line, "mqtt: tracks: not valid: KeyError")
+            session.put(TRACKS.key("vehicle1"), tracks("end"))
+            while json.loads(await station.wait(f"{BASE}/objects"))["event_type"] != "end":
+                pass
+
+    with_station(port, work)
+
+
+def test_without_its_extra_it_is_refused_with_the_command(tmp_path: Path) -> None:
+    (tmp_path / "aiomqtt.py").write_text("raise ModuleNotFoundError(name='aiomqtt')")
+    options = {"mqtt": {}, "cameras": [], "vehicle": "vehicle1", "zenoh": settings_for_child(ZenohSection())}
+    ended = subprocess.run(
+        [sys.executable, "-m", "companion.mqtt"],
+        input=json.dumps(options) + "\n",
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])},
+        capture_output=True,
+        text=True,
+    )
+    assert (ended.returncode, ended.stderr) == (EXIT_REFUSED, "")
+    assert install_command("aiomqtt") in ended.stdout
 
 
 @pytest.mark.parametrize("service", [["--mqtt-commands", "true"]], indirect=True)

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 import pytest
 
 from companion.mqtt import webhooks
-from companion.mqtt.webhooks import MOST_EVENTS, Webhook
+from companion.mqtt.webhooks import MOST_BYTES, MOST_EVENTS, Webhook
 
 pytestmark = pytest.mark.realtime
 
@@ -104,3 +104,13 @@ def test_a_server_that_hangs_costs_a_bounded_queue(monkeypatch: pytest.MonkeyPat
 
     said = with_server(lambda number: None if number <= 4 else 204, work)
     assert "too slowly" in said[0]
+
+
+def test_large_events_that_wait_are_bounded_in_bytes() -> None:
+    async def work(webhook: Webhook, server: Server) -> None:
+        for number in range(10):
+            webhook.put(str(number), bytes(MOST_BYTES // 4))
+        await wait_for(server, 4)
+        assert [key for key, _ in server.requests] == ["6", "7", "8", "9"]
+
+    with_server(lambda _: 204, work)
