@@ -165,7 +165,7 @@ AWAITED_TASKS = {
     "companion/ground_station/__main__.py",
     "companion/simulation/demo.py",
     "companion/language/serve.py",
-    "companion/mqtt/__main__.py",
+    "companion/mqtt/publisher.py",
     "companion/mqtt/broker.py",
     "companion/perception/supervisor.py",
     "companion/simulation/play.py",

@@ -169,13 +169,11 @@ class BrokerLink:
             self._waiting.set()
             try:
                 yield client
-            except asyncio.CancelledError:
-                with suppress(aiomqtt.MqttError, TimeoutError):  # the will says it then
+            finally:  # an orderly end revokes the will
+                self._connected = False
+                with suppress(aiomqtt.MqttError, TimeoutError):
                     async with asyncio.timeout(1.0):
                         await client.publish(self._available, OFFLINE, qos=1, retain=True)
-                raise
-            finally:
-                self._connected = False
 
     async def _work(self, client: aiomqtt.Client) -> None:
         async with asyncio.TaskGroup() as group:

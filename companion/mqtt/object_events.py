@@ -162,33 +162,24 @@ class ObjectEvents:
         offset_ns, ellipse = self._unix_offset_ns(), event["error_ellipse"]
         left, top, right, bottom = event["xyxy"]
         width, height = body["width"], body["height"]
+        same = ("track_id", "object_id", "confidence", "stamp_ns", "moving")
+        same += ("latitude_deg", "longitude_deg", "altitude_amsl_m")
+        times = {"time": "stamp_ns", "first_seen": "first_ns", "last_seen": "last_ns"}
         return {
             "event_id": uuid4().hex,
             "vehicle": body["vehicle"],
             "camera": body["camera"],
             "id": name,
-            "track_id": event["track_id"],
-            "object_id": event["object_id"],
             "class": event["class_name"],
-            "confidence": event["confidence"],
-            "time": _utc(event["stamp_ns"] + offset_ns),
-            "first_seen": _utc(event["first_ns"] + offset_ns),
-            "last_seen": _utc(event["last_ns"] + offset_ns),
-            "stamp_ns": event["stamp_ns"],
-            # Fractions of the image: left, top, right, bottom.
-            "box": [
-                round(value, 4) for value in (left / width, top / height, right / width, bottom / height)
-            ],
-            "latitude_deg": event["latitude_deg"],
-            "longitude_deg": event["longitude_deg"],
-            "altitude_amsl_m": event["altitude_amsl_m"],
+            **{key: event[key] for key in same},
+            **{key: _utc(event[stamp] + offset_ns) for key, stamp in times.items()},
+            # Fractions of the image.
+            "box": [round(each, 4) for each in (left / width, top / height, right / width, bottom / height)],
             "error_m": None if ellipse is None else ellipse["semi_major_m"],
-            "moving": event["moving"],
         }
 
 
 def _utc(unix_ns: int) -> str:
     """Return ISO 8601 with milliseconds."""
-    return (
-        datetime.fromtimestamp(unix_ns / 1e9, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-    )
+    text = datetime.fromtimestamp(unix_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+    return text.replace("+00:00", "Z")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -153,15 +154,17 @@ class _Publisher:
     def _on_status(self, body: dict[str, Any]) -> None:
         if self._link is None:
             return
-        place, state = self._place, _json(state_of(body, self._place))
+        place, state = (
+            self._place,
+            _json(state_of(body, self._place)),
+        )  # before anything of a wrong body is sent
         # Each time: the broker may publish the will of a connection that was lost long after the next began.
         self._link.state(f"{self._base}/available", ONLINE.encode())
         self._status_s = time.monotonic()
         self._link.state(f"{self._base}/state", state)
         if place.get("latitude_deg") is not None:
             names = {"latitude": "latitude_deg", "longitude": "longitude_deg", "altitude": "altitude_amsl_m"}
-            about = {name: place[key] for name, key in names.items()}
-            self._link.state(f"{self._base}/place", _json(about))
+            self._link.state(f"{self._base}/place", _json({name: place[key] for name, key in names.items()}))
 
     def _on_command(self, text: str) -> None:
         if self._commands >= _MOST_COMMANDS:
@@ -218,10 +221,11 @@ def _json(body: dict[str, Any]) -> bytes:
 
 def publish(client: ChildClient) -> None:
     """Publish until the parent ends. Raises MqttError: something in the settings cannot be used."""
-
-    async def run(bus: zenoh.Session) -> None:
-        await _Publisher(client, bus).run(client)
-
     with client.open_bus() as bus:
         if bus is not None:
-            asyncio.run(run(bus))
+            asyncio.run(_publish(client, bus))
+
+
+async def _publish(client: ChildClient, bus: zenoh.Session) -> None:
+    await _Publisher(client, bus).run(client)
+    os._exit(0)  # without waiting for a thread that still connects to a broker

@@ -170,6 +170,29 @@ def test_a_retained_or_large_message_is_no_command(tmp_path: Path) -> None:
         with_link(work, port)
 
 
+def test_a_fault_of_ours_is_followed_by_offline(tmp_path: Path) -> None:
+    def fail(_: str) -> None:
+        raise ArithmeticError
+
+    async def run() -> None:
+        said, broker = Said(), broker_of(MqttSection(url=f"mqtt://127.0.0.1:{port}"))
+        link = BrokerLink(broker, AVAILABLE, said.say, COMMAND, fail)
+        running = asyncio.create_task(link.run())
+        await said.wait("open mqtt://")
+        async with station(port) as client:
+            await client.subscribe(AVAILABLE)
+            link.state(AVAILABLE, b"online")
+            assert (await next_of(client, AVAILABLE))[0] == "online"
+            await client.publish(COMMAND, "stop")
+            assert (await next_of(client, AVAILABLE))[0] == "offline"
+        (error,) = await asyncio.gather(running, return_exceptions=True)
+        assert isinstance(error, ExceptionGroup)
+
+    port = free_port(socket.SOCK_STREAM)
+    with mosquitto.broker(port, tmp_path):
+        asyncio.run(run())
+
+
 def test_a_refused_subscription_is_said_by_its_topic() -> None:
     port = free_port(socket.SOCK_STREAM)
 

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -226,3 +227,28 @@ def test_nothing_of_images_is_encoded_without_a_new_object(service: ServiceProce
                 assert not published.get(IMAGE.name)
 
     with_station(port, work)
+
+
+def test_a_broker_that_takes_no_connection_delays_no_end(filming: list[str], tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        full = stack.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        port = full.getsockname()[1]
+        for _ in range(4):
+            client = stack.enter_context(socket.socket())
+            client.setblocking(False)
+            client.connect_ex(("127.0.0.1", port))
+        before = connecting_to(port)
+        flags = [*filming, "--mqtt-url", f"mqtt://127.0.0.1:{port}"]
+        autopilot = stack.enter_context(heartbeats())
+        service = stack.enter_context(running_service(autopilot, flags, cwd=tmp_path))
+        deadline_s = time.monotonic() + WAIT_S
+        while connecting_to(port) <= before and time.monotonic() < deadline_s:
+            time.sleep(0.02)
+        service.stop()
+        assert not any("mqtt: has not ended" in line for line in service.last_lines())
+
+
+def connecting_to(port: int) -> int:
+    """Return the number of connections to a port that nobody has taken yet."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()]
+    return sum(row[2].endswith(f":{port:04X}") and row[3] == "02" for row in rows)  # TCP_SYN_SENT
