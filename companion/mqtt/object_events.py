@@ -162,8 +162,7 @@ class ObjectEvents:
         offset_ns, ellipse = self._unix_offset_ns(), event["error_ellipse"]
         left, top, right, bottom = event["xyxy"]
         width, height = body["width"], body["height"]
-        same = ("track_id", "object_id", "confidence", "stamp_ns", "moving")
-        same += ("latitude_deg", "longitude_deg", "altitude_amsl_m")
+        place = ("latitude_deg", "longitude_deg", "altitude_amsl_m", "moving")
         times = {"time": "stamp_ns", "first_seen": "first_ns", "last_seen": "last_ns"}
         return {
             "event_id": uuid4().hex,
@@ -171,7 +170,7 @@ class ObjectEvents:
             "camera": body["camera"],
             "id": name,
             "class": event["class_name"],
-            **{key: event[key] for key in same},
+            **{key: event[key] for key in ("track_id", "object_id", "confidence", "stamp_ns", *place)},
             **{key: _utc(event[stamp] + offset_ns) for key, stamp in times.items()},
             # Fractions of the image.
             "box": [round(each, 4) for each in (left / width, top / height, right / width, bottom / height)],
