@@ -15,6 +15,7 @@ from pathlib import Path
 from companion.doctor.check import Check, fault, ok, unknown, warning
 from companion.doctor.facts import CheckKind, Facts
 from companion.host.load import busy_text
+from vision.home import expanded
 
 # `vcgencmd get_throttled`: now, and since the start.
 _PI_BITS = (
@@ -147,7 +148,7 @@ def _scheduling(facts: Facts) -> Iterator[Check]:
 def _disk(facts: Facts) -> Iterator[Check]:
     directory = facts.settings.recording.directory
     if directory:
-        folder = Path(directory).expanduser().absolute()
+        folder = expanded(directory).absolute()
         yield _space("recordings", folder, facts.settings.recording.max_total_mb)
     yield _space("disk", facts.machine.log if facts.machine.log.exists() else Path("/"), None)
 

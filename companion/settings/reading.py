@@ -51,8 +51,8 @@ __all__ = [
 DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
 # COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. No section's name begins with another's and `_`.
 ENVIRONMENT_PREFIX = "COMPANION_"
-# Other variables of this project, which no installed program reads.
-_NO_SETTINGS = ("COMPANION_TEST_", "COMPANION_SITL_")
+# Other variables of this project: of its tests, and of the models folder.
+_NO_SETTINGS = ("COMPANION_TEST_", "COMPANION_SITL_", "COMPANION_MODELS_FOLDER")
 
 
 class ConfigurationError(ValueError):

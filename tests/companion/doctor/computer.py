@@ -135,6 +135,7 @@ STATUS: dict[str, Any] = {
     "uptime_s": 60.0,
     "healthy": True,
     "unhealthy": [],
+    "changed_settings": [],
     "parts": [
         {"name": name, "state": "ready", "reason": "", "since_ns": 0, "next_try_ns": None}
         for name in ("autopilot", "camera", "zenoh")
