@@ -38,6 +38,8 @@ NOT_RUN = {
     "companion calibrate photos": "photographs of a printed board",
     "companion calibrate colour": "images of two cameras",
     "companion detect images/": "photographs of a marker",
+    "mosquitto_sub ": "a client of MQTT; tests/companion/mqtt has one",
+    "ffplay ": "a window; tests/companion/ground_station plays the video",
     "--pull": "a download",
     "--from yolov8n": "a download, and photographs",
     "--most 50": "a service on another computer",

@@ -34,7 +34,7 @@ OPTIONAL = {
         "vision.training.",
         "vision.yolo.",
     ),
-    "aiomqtt": ("companion.mqtt.broker",),
+    "aiomqtt": ("companion.mqtt.broker", "companion.mqtt.publisher"),
     "httpx": ("companion.mqtt.webhooks",),
     "mcap": (
         "companion.learning.collect",
