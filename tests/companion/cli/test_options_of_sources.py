@@ -375,6 +375,7 @@ class Messages:
         self.hud = Hud(("a line",), None)
         self.watched = Watched(True, depth=True, clouds=True)
         self.selections: deque[Any] = deque()
+        self.detecting = None
         self.path_request = None
         self.telemetry = level_vehicle()
         self.previews: list[AnyPreview] = []

@@ -163,7 +163,7 @@ def test_rectangle_of_a_station_is_followed_if_allowed(tmp_path: Path, *, follow
             ages_ms = check_status(statuses, list(bus.frames.values()), track_id)
             print(f"{len(statuses)} statuses, {len(ages_ms)} active; moved {moved_m:.1f} m")
             print(f"age: median {median(ages_ms):.0f} ms, at most {max(ages_ms):.0f} ms")
-            assert len(ages_ms) > 6 * FLIGHT_S
+            assert len(ages_ms) > 2 * FLIGHT_S
             assert percentile_98(ages_ms) <= MAX_AGE_MS
             assert (moved_m > 5.0) == follows
             assert any(command.startswith("follow") for command, _ in bus.commands) == follows
