@@ -67,19 +67,26 @@ async def _run(client: ChildClient) -> None:
     cameras = _cameras(options, directory, warn)
     computer = ComputerStatus(Path.cwd() if directory is None else directory)
     cameras[0].sources += [texts.due, computer.due]
+    feed = BusFeed(client, options["vehicle"])
+    _subscribe(feed, cameras, texts)
+    cameras[0].sources.append(_report_losses(feed, texts, client.say))
+    trackings = []
+    for camera, about in zip(cameras, options["cameras"], strict=False):
+        trackings.append(_track(feed, camera, about, texts, section))
+        _offer_parameters(feed, camera, about, texts, section)
+
+    def on_standstill() -> None:
+        for tracking in trackings:
+            tracking.abandon_clicks()
+
     link = StationLink(
         parse_link_url(section.url),
         options["system_id"],
         cameras,
         signer=None if signing_key_file is None else FrameSigner(read_key(signing_key_file)),
         say=warn,
+        on_standstill=on_standstill,
     )
-    feed = BusFeed(client, options["vehicle"])
-    _subscribe(feed, cameras, texts)
-    cameras[0].sources.append(_report_losses(feed, texts, client.say))
-    for camera, about in zip(cameras, options["cameras"], strict=False):
-        _track(feed, camera, about, texts, section)
-        _offer_parameters(feed, camera, about, texts, section)
     open_parts: set[str] = set()
 
     def on_open(part: str) -> None:
@@ -169,7 +176,7 @@ def _report_losses(
 
 def _track(
     feed: BusFeed, camera: Camera, about: dict[str, Any], texts: StatusTexts, section: GroundStationSection
-) -> None:
+) -> Tracking:
     """Add the tracking and the objects of a camera."""
     tracking = Tracking(
         about["word"],
@@ -195,7 +202,13 @@ def _track(
 
     feed.subscribe(STATUS, None, on_status)
     feed.subscribe(DETECTIONS, camera.name, on_detections)
+
+    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
+        tracking.on_vehicle(cast("VehicleBody", parse_object(payload)))
+
+    feed.subscribe(VEHICLE, None, on_vehicle)
     feed.subscribe(COMMAND_STATE, None, on_command_state, _EVENTS_KEPT)
+    return tracking
 
 
 def _offer_parameters(

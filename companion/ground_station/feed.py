@@ -6,6 +6,7 @@ import asyncio
 import queue
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from threading import Lock, Thread
 from typing import Any
 
@@ -16,12 +17,11 @@ from companion.bus.client import (
     NoAnswerError,
     SettingsRefusedError,
     message_of,
-    send_command,
     set_settings,
     subscribe_kept,
 )
-from companion.bus.topics import IMAGE, Topic
-from companion.host.peer_data import PeerDataError, parse_object
+from companion.bus.topics import IMAGE, LARGEST_JSON_BYTES, Topic, command_key
+from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 
 OnMessage = Callable[[bytes, bytes | None], None]
 """Called in the loop with payload and attachment."""
@@ -34,6 +34,7 @@ _IMAGES_KEPT = 2
 _POLL_S = 0.5
 # A click that the service answers later flies nothing.
 _ANSWER_S = 5.0
+_UNREACHED = {"success": False, "refused": False, "reason": "the service is not reached"}
 
 
 class BusFeed:
@@ -68,8 +69,27 @@ class BusFeed:
             self._changes.put((camera, bool(users)))
 
     def send_command(self, text: str, on_reply: OnReply) -> None:
-        """Send a command to the service, and call back in the loop with its reply or why there is none."""
-        self._ask(lambda session: send_command(session, self._vehicle, text, timeout_s=_ANSWER_S), on_reply)
+        """Send a command to the service, and call back in the loop with its reply or why there is none.
+
+        From the loop, so that the service gets commands in their order: a `hold` after its `follow`.
+        """
+        reason = f"no answer of the service within {_ANSWER_S:g} s: see `companion echo status`"
+        replies: list[Mapping[str, Any]] = [{"success": False, "reason": reason}]
+
+        def on_zenoh(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                with suppress(PeerDataError):
+                    replies.append(parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES)))
+
+        def on_end() -> None:
+            if not self._loop.is_closed():
+                self._loop.call_soon_threadsafe(on_reply, replies[-1])
+
+        if (session := self._session) is None:
+            self._loop.call_soon(on_reply, _UNREACHED)
+            return
+        callback, sender = zenoh.handlers.Callback(on_zenoh, on_end), str(session.zid())
+        session.get(command_key(self._vehicle), callback, payload=text, attachment=sender, timeout=_ANSWER_S)
 
     def set_settings(self, values: Mapping[str, Any] | None, on_reply: OnReply) -> None:
         """Set settings of the service (None: ask for them), and call back in the loop.
@@ -87,8 +107,7 @@ class BusFeed:
     def _ask(self, ask: Callable[[zenoh.Session], Mapping[str, Any]], on_reply: OnReply) -> None:
         """Ask the service in a thread, and call back in the loop."""
         if (session := self._session) is None:
-            unreached = {"success": False, "refused": False, "reason": "the service is not reached"}
-            self._loop.call_soon(on_reply, unreached)
+            self._loop.call_soon(on_reply, _UNREACHED)
             return
 
         def run() -> None:

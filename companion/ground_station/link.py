@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.ground_station.camera import COMPONENT_IDS
 from companion.ground_station.component import Component, Message, is_addressed
+from companion.host.clock import StandstillWatch
 from companion.host.tasks import error_text
 from companion.vehicle.autopilot_driver import AUTOPILOT_COMPONENT
 from companion.vehicle.byte_link import ByteLink, Source, open_link
@@ -51,7 +52,8 @@ class StationLink:
     Args:
         url: of the station or router. system_id: of the vehicle. components: those that are on it.
         signer: signs what is sent, and checks what is received; None: nothing is signed.
-        say: called with a line.
+        say: called with a line. on_standstill: called after the computer or this process stood still, when
+            what waited on the link has been left out.
 
     Attributes:
         components: those that have an id. dropped: requests that were left out.
@@ -65,8 +67,10 @@ class StationLink:
         *,
         signer: FrameSigner | None,
         say: Callable[[str], None],
+        on_standstill: Callable[[], None] = lambda: None,
     ) -> None:
         self.url, self.components = url, list(components)
+        self._on_standstill, self._watch = on_standstill, StandstillWatch()
         self.dropped = 0
         self._system_id, self._signer, self._say = system_id, signer, say
         self._reception = Reception()
@@ -147,6 +151,8 @@ class StationLink:
         link = self._link
         if link is None:  # in the call that opens it
             return
+        if self._stood_still():
+            return
         now_ns = time.monotonic_ns()
         for frame in self._reception.feed(data, source, datagram=link.datagrams, keep=self._peer):
             if not frame.checked or (
@@ -206,7 +212,22 @@ class StationLink:
                 if heartbeat or is_addressed(message, self._system_id, component.component_id):
                     self._send_all(component, partial(component.handle, message, now_ns))
 
+    def _stood_still(self) -> bool:
+        """Whether the computer or this process stood still; then what waits is left out: it is outdated."""
+        seen = self._watch.observe()
+        if seen.standstill is None or self._link is None:
+            return False
+        self._watch.acknowledge(seen)
+        self._link.discard_received()
+        self._reception.discard_received()
+        self._waiting.clear()
+        self._on_standstill()
+        self._say(f"stood still for {seen.standstill.seconds:.1f} s: requests from before are left out")
+        return True
+
     def _tick(self, now_ns: int) -> None:
+        self._stood_still()
+        self._watch.acknowledge(self._watch.observe())
         self._allowance = _BATCH
         self._handle(now_ns)
         for component in tuple(self.components):

@@ -19,7 +19,11 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.bodies.service import CommandStateBody
+from companion.bus.bodies.vehicle import VehicleBody
 from companion.ground_station.component import Answer, Command, Message, RequestTable
+from companion.host.clock import PAUSED_S
+from companion.vehicle.gimbal import Address
+from vision.tracking import TARGET_CLASS
 
 Reply = Mapping[str, Any]
 SendCommand = Callable[[str, Callable[[Reply], None]], None]
@@ -63,6 +67,10 @@ _IDLE_REPEATED_NS = 2_000 * _MS
 _PROGRESS_NS = 500 * _MS
 # A station repeats a command whose acknowledgement was lost; QGroundControl after 3 s, without counting it.
 _REPEATED_NS = 5_000 * _MS
+_MOST_SENDERS = 64
+FOLLOW_WITHIN_NS = round(PAUSED_S * 1e9)
+"""A click whose selection takes longer is not followed: the operator may want something else by then."""
+_OWN_FOLLOW = re.compile(r"follow track=\d+")
 # An image that `select` still has (the last second), and whose boxes are where the operator points.
 _IMAGE_NS = 500 * _MS
 # A click this far beside a box, of the image's width, still means it; and half a side of the square around
@@ -146,10 +154,16 @@ class Selection:
 
 @dataclass(slots=True)
 class _Request:
-    """A command of a station that waits for the service, with its result at the end."""
+    """A command of a station that waits for the service.
+
+    Attributes:
+        result: at the end. mode: of the vehicle when it came. newest_ns: when it was repeated last.
+    """
 
     command: Command
     progress_ns: int
+    mode: str | None
+    newest_ns: int
     result: int | None = None
 
     def is_repeated_by(self, command: Command) -> bool:
@@ -160,16 +174,6 @@ class _Request:
             command.number,
             str(command.parameters),
         )
-
-
-@dataclass(slots=True)
-class _Follow:
-    """The `follow` that was sent last. `identifier`: as in command_state; None until the service answers."""
-
-    text: str
-    sent_ns: int
-    identifier: str | None = None
-    on_its_way: bool = True
 
 
 class Stream:
@@ -233,9 +237,11 @@ class Tracking:
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
         self._now_ns = self._idle_until_ns = 0
         self._pending: list[_Request] = []
-        self._done: _Request | None = None
+        self._clicks: dict[Address, _Request] = {}  # the newest of each sender
         self._unsent: list[Message] = []
-        self._follow: _Follow | None = None
+        self._mode: str | None = None
+        self._to_follow: tuple[int, _Request] | None = None  # track, and the click that selected it
+        self._follow_sent_ns: int | None = None  # of a `follow` that the service has not answered yet
         self._open: dict[str, tuple[str, int]] = {}  # id of a command that has not ended → text, time
         self._ended = ""  # id of the one that has ended last
         self._service: str | None = None
@@ -277,19 +283,33 @@ class Tracking:
             if track_id != (None if self.selection is None else self.selection.track_id):
                 self._select(track_id)
 
+    def on_vehicle(self, vehicle: VehicleBody) -> None:
+        """Use the vehicle's mode: a pilot may change it between a click and its `follow`."""
+        self._mode = vehicle["mode"]
+
     def on_service(self, service: str) -> None:
         """Forget what another process of the service knew. `service`: of its status."""
         if self._service not in (None, service):
             self._select(None)
-            self._follow = self.newest = None
+            self.newest = self._to_follow = self._follow_sent_ns = None
         self._open = {key: each for key, each in self._open.items() if key.rpartition("-")[0] == service}
         self._service = service
+
+    def abandon_clicks(self) -> None:
+        """The computer or this process stood still: no click from before may select or fly."""
+        self._to_follow = None
+        for request in tuple(self._pending):
+            if request.command.number != mavlink.MAV_CMD_CAMERA_STOP_TRACKING:
+                self._finish(request, _FAILED)
 
     # --- the component -------------------------------------------------------------------------------
 
     def due(self, now_ns: int) -> list[Message]:
         """Return what is to be sent now. Called at least 20 times a second."""
         self._now_ns = now_ns
+        if self._to_follow is not None:
+            selected, self._to_follow = self._to_follow, None
+            self._follow(*selected)
         for request in self._pending:
             if now_ns >= request.progress_ns:
                 request.progress_ns = now_ns + _PROGRESS_NS
@@ -322,15 +342,11 @@ class Tracking:
             return Answer(_IN_PROGRESS)
         if self._pending:
             return Answer(_REJECTED)
-        done = self._done
-        if (
-            done is not None
-            and done.result == mavlink.MAV_RESULT_ACCEPTED
-            and done.is_repeated_by(command)
-            and command.received_ns - done.command.received_ns < _REPEATED_NS
-            and self.selection is not None
-        ):
-            return Answer(done.result)
+        if (repeated := self._answer_to_repetition(command)) is not None:
+            return repeated
+        if (flown := self._flown_by_others()) is not None:
+            self._say(_WARNING, f"not selected: {flown!r} needs the object selected now: end it first")
+            return Answer(_DENIED)
         frame, on_object = self.newest, True
         if frame is not None and self._now_ns - frame["captured_ns"] > _IMAGE_NS:
             frame = None
@@ -343,9 +359,45 @@ class Tracking:
             self._say(_WARNING, f"not selected: {error}")
             return Answer(_DENIED)
         text = _select_text(self._camera, rectangle, None if frame is None else frame["captured_ns"])
-        on_reply = partial(self._on_selected, self._begin(command), as_point=point, on_object=on_object)
-        self._send(text, on_reply)
+        request = self._clicks[command.sender] = self._begin(command)
+        if len(self._clicks) > _MOST_SENDERS:
+            self._clicks.pop(next(iter(self._clicks)))
+        self._send(text, partial(self._on_selected, request, as_point=point, on_object=on_object))
         return Answer(None)
+
+    def _answer_to_repetition(self, command: Command) -> Answer | None:
+        """Return the answer to a click that a station only sends again: it must not select and fly again."""
+        before = self._clicks.get(command.sender)
+        if (
+            before is None
+            or before.result not in (mavlink.MAV_RESULT_ACCEPTED, _CANCELLED)
+            or not before.is_repeated_by(command)
+            or command.received_ns - before.newest_ns >= _REPEATED_NS
+        ):
+            return None
+        before.newest_ns = command.received_ns
+        if before.result == mavlink.MAV_RESULT_ACCEPTED and self.selection is not None:
+            return Answer(before.result)
+        self._say(_WARNING, "not selected: the same click has ended; to repeat it, wait for 5 s")
+        return Answer(_REJECTED)
+
+    def _flown_by_others(self) -> str | None:
+        """Return the open command of another that would lose its object with the selection; None: none."""
+        selection = self.selection
+        if selection is None or not self._steers:
+            return None
+        detection = selection.detection
+        if detection is not None and detection["class_name"] != TARGET_CLASS:
+            return None  # the detector's track goes on
+        objects = {f"track={selection.track_id}", f"class={TARGET_CLASS}", TARGET_CLASS}
+        open_texts = (text for text, _ in self._open.values())
+        return next(
+            (each for each in open_texts if objects & {*each.split()} and not self._is_own(each)), None
+        )
+
+    def _is_own(self, text: str) -> bool:
+        """Whether a command is as a click sends it: after a restart of this process nothing else is known."""
+        return self._follows and _OWN_FOLLOW.fullmatch(text) is not None
 
     def _on_selected(self, request: _Request, reply: Reply, *, as_point: bool, on_object: bool) -> None:
         track_id = reply.get("track")
@@ -366,18 +418,27 @@ class Tracking:
             self._say(_INFO, "not followed: this is not the steering camera")
         elif not on_object:
             self._say(_INFO, "not followed: no object is at this point; draw a rectangle around it")
-        else:
-            follow = self._follow = _Follow(f"follow track={track_id}", self._now_ns)
-            self._send(follow.text, partial(self._on_follow, follow))
+        else:  # with the time of `due`: this process may have stood still since its newest call
+            self._to_follow = track_id, request
 
-    def _on_follow(self, follow: _Follow, reply: Reply) -> None:
-        identifier, follow.on_its_way = reply.get("id"), False
+    def _follow(self, track_id: int, request: _Request) -> None:
+        if self._now_ns - request.command.received_ns > FOLLOW_WITHIN_NS:
+            self._say(_WARNING, f"not followed: the selection took longer than {PAUSED_S:g} s; click again")
+        elif request.mode != self._mode:
+            self._say(
+                _WARNING, f"not followed: the mode has become {self._mode} since the click; click again"
+            )
+        else:
+            self._follow_sent_ns, text = self._now_ns, f"follow track={track_id}"
+            self._send(text, partial(self._on_follow, text, self._now_ns))
+
+    def _on_follow(self, text: str, sent_ns: int, reply: Reply) -> None:
+        if self._follow_sent_ns == sent_ns:
+            self._follow_sent_ns = None
         if not reply["success"]:  # without an id it may yet be executed
             self._say(_WARNING, f"not followed: {reply['reason']}")
-        if isinstance(identifier, str):
-            follow.identifier = identifier
-            if reply["success"] and identifier != self._ended:  # command_state may come later
-                self._open.setdefault(identifier, (follow.text, follow.sent_ns))
+        elif (identifier := reply["id"]) != self._ended:  # command_state may come later
+            self._open.setdefault(identifier, (text, sent_ns))
 
     def _on_stop(self, command: Command) -> Answer:
         self._now_ns = command.received_ns
@@ -387,9 +448,12 @@ class Tracking:
             if request.command.number == command.number:  # one does the same for all
                 return Answer(_IN_PROGRESS if request.is_repeated_by(command) else _REJECTED)
             self._finish(request, _CANCELLED)
+        if (flown := self._flown_by_others()) is not None:
+            self._say(_WARNING, f"still selected: {flown!r} needs the object: end that command instead")
+            return Answer(_DENIED)
         # Held first: a vehicle whose object is gone would brake with a warning.
         texts = ["hold"] if self._is_following() else []
-        self._follow = None
+        self._to_follow = self._follow_sent_ns = None
         self._stop(self._begin(command), [*texts, f"select camera={self._camera}"])
         return Answer(None)
 
@@ -406,22 +470,20 @@ class Tracking:
         self._finish(request, mavlink.MAV_RESULT_ACCEPTED if request.result is None else request.result)
 
     def _is_following(self) -> bool:
-        """Whether the vehicle's newest command is our `follow`, and it has not ended."""
-        follow, newest = self._follow, next(reversed(self._open.items()), None)
-        if follow is None:
-            return False
-        if newest is None or newest[1][1] < follow.sent_ns:
-            return follow.on_its_way
-        return newest[0] == follow.identifier or (follow.identifier is None and newest[1][0] == follow.text)
+        """Whether the vehicle's newest command is a click's `follow`, and it has not ended."""
+        text, stamp_ns = next(reversed(self._open.values()), ("", 0))
+        on_its_way = self._follow_sent_ns is not None and stamp_ns < self._follow_sent_ns
+        return on_its_way or self._is_own(text)
 
     def _begin(self, command: Command) -> _Request:
-        request = _Request(command, command.received_ns + _PROGRESS_NS)
+        received_ns = command.received_ns
+        request = _Request(command, received_ns + _PROGRESS_NS, self._mode, received_ns)
         self._pending.append(request)
         return request
 
     def _finish(self, request: _Request, result: int) -> None:
         if request in self._pending:
-            request.result, self._done = result, request
+            request.result = result
             self._pending.remove(request)
             self._unsent.append(_ack(request.command, result))
 

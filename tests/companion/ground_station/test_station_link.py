@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -16,6 +17,7 @@ from companion.ground_station import link as link_module
 from companion.ground_station.camera import Camera
 from companion.ground_station.component import Message
 from companion.ground_station.link import StationLink
+from companion.host import clock
 from companion.host.passing import PassingError
 from companion.vehicle.framing import frames_of
 from companion.vehicle.link_url import parse_link_url
@@ -229,6 +231,22 @@ async def test_noise_and_unknown_messages_are_ignored(tmp_path: Path) -> None:
             peer.socket.sendto(data, peer.address)
         peer.ask(522, 1)
         await peer.next("CAMERA_SETTINGS")
+
+
+async def test_requests_of_before_a_standstill_are_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(clock, "PAUSED_S", 0.3)
+    async with running(cameras_of(tmp_path)) as (_, peer, lines):
+        await peer.next("HEARTBEAT")
+        for _ in range(100):
+            peer.ask(521, 1)
+        time.sleep(0.5)  # noqa: ASYNC251 - the process stands still
+        await peer.until(lambda: lines)
+        peer.ask(522, 1)
+        await peer.next("CAMERA_SETTINGS")
+        assert "CAMERA_INFORMATION" not in [each.get_type() for each in peer.received]
+        assert len(lines) == 1
 
 
 async def test_fault_in_one_answer_leaves_the_others(tmp_path: Path) -> None:

@@ -224,6 +224,8 @@ def test_repeated_command_selects_once() -> None:
     assert station.request(RECTANGLE, 0.1, 0.1, 0.9, 0.9) == [ACCEPTED]
     assert len(station.sent) == 1
     station.pass_time(3000)
+    assert station.request(RECTANGLE, 0.1, 0.1, 0.9, 0.9) == [ACCEPTED]
+    station.pass_time(5000)
     assert station.request(RECTANGLE, 0.1, 0.1, 0.9, 0.9) == []
     assert len(station.sent) == 2
 
@@ -328,6 +330,91 @@ def test_refused_follow_is_said_and_the_selection_stays() -> None:
     assert "not in the air" in station.texts[-1]
     station.request(STOP)
     assert "hold" not in station.sent
+
+
+def test_repeated_click_does_not_fly_after_the_stop() -> None:
+    station = following()
+    station.request(STOP)
+    station.reply()
+    station.reply(track=None)
+    sent = len(station.sent)
+    station.pass_time(3000)
+    click = (RECTANGLE, 0.15, 0.25, 0.3, 0.75)
+    assert station.request(*click) == [REJECTED]
+    assert len(station.sent) == sent
+    station.pass_time(5000)
+    assert station.request(*click) == []
+
+
+def test_click_of_a_second_station_does_not_hide_a_repeated_one() -> None:
+    station = following()
+    station.request(RECTANGLE, 0.2, 0.2, 0.4, 0.4, sender=(254, 190))
+    station.reply(track=8)
+    sent = len(station.sent)
+    assert station.request(RECTANGLE, 0.15, 0.25, 0.3, 0.75) == [ACCEPTED]
+    assert len(station.sent) == sent
+
+
+def test_selection_that_comes_late_is_not_followed() -> None:
+    station = Station(follows=True)
+    station.show(detection(7, PERSON))
+    station.request(RECTANGLE, 0.15, 0.25, 0.3, 0.75)
+    station.now_ns += tracking.FOLLOW_WITHIN_NS + MS
+    assert station.reply() == [ACCEPTED]
+    assert len(station.sent) == 1
+    assert "not followed" in station.texts[0]
+
+
+def test_click_is_not_followed_after_a_change_of_mode() -> None:
+    station = Station(follows=True)
+    station.tracking.on_vehicle({"mode": "hold"})  # type: ignore[typeddict-item]
+    station.request(RECTANGLE, 0.15, 0.25, 0.3, 0.75)
+    station.tracking.on_vehicle({"mode": "position"})  # type: ignore[typeddict-item]
+    assert station.reply() == [ACCEPTED]
+    assert len(station.sent) == 1
+    assert "position" in station.texts[0]
+
+
+def test_click_from_before_a_standstill_flies_nothing() -> None:
+    station = Station(follows=True)
+    station.show(detection(7, PERSON))
+    station.request(RECTANGLE, 0.15, 0.25, 0.3, 0.75)
+    station.tracking.abandon_clicks()
+    assert results(station.pass_time(0)) == [FAILED]
+    station.reply()
+    station.pass_time(100)
+    assert len(station.sent) == 1
+
+
+def test_restarted_process_holds_what_a_click_began() -> None:
+    station = Station(follows=True)
+    station.tracking.on_command_state(command_state("s-1", "select x=0", "ended", "track 7, a person"))
+    station.tracking.on_command_state(command_state("s-2", "follow track=7", "in_progress"))
+    station.request(STOP)
+    assert station.sent == ["hold"]
+
+
+@pytest.mark.parametrize("text", ["approach track=7", "approach target", "orbit class=target radius=5"])
+@pytest.mark.parametrize("request_", [(STOP,), (RECTANGLE, 0.5, 0.5, 0.6, 0.6), (POINT, 0.5, 0.5)])
+def test_object_of_anothers_command_stays_selected(text: str, request_: tuple[Any, ...]) -> None:
+    station = Station(follows=True)
+    station.select()
+    station.reply(success=False, reason="not in the air")
+    station.show(detection(7, PERSON, class_name="target"), sequence=2)
+    station.tracking.on_command_state(command_state("s-3", text, "in_progress"))
+    sent = len(station.sent)
+    assert station.request(*request_) == [DENIED]
+    assert len(station.sent) == sent
+    assert text in station.texts[-1]
+    station.tracking.on_command_state(command_state("s-3", text, "ended"))
+    assert station.request(*request_) == []
+
+
+def test_detected_object_of_anothers_command_may_be_deselected() -> None:
+    station = Station()
+    station.select()
+    station.tracking.on_command_state(command_state("s-3", "approach track=7", "in_progress"))
+    assert station.request(STOP) == []
 
 
 def test_point_on_no_object_is_not_followed() -> None:
