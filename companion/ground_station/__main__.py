@@ -36,7 +36,7 @@ from companion.ground_station.parameters import Parameter, Parameters, definitio
 from companion.ground_station.positions import Positions
 from companion.ground_station.reports import ComputerStatus, StatusTexts
 from companion.ground_station.tracking import FLAGS, Tracking
-from companion.ground_station.video import serving_video
+from companion.ground_station.video import serve_video
 from companion.host.peer_data import parse_object
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.driver import LinkError
@@ -100,12 +100,13 @@ async def _run(client: ChildClient) -> None:
         asyncio.create_task(asyncio.to_thread(feed.run, partial(on_open, "bus"))),
         asyncio.create_task(client.ended()),
     ]
-    try:
+    if section.video_listen is not None:
         images = options["image_width"], options["image_rate_hz"]
-        async with serving_video(section, cameras, feed, *images, warn):
-            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
-            for task in done:
-                task.result()
+        tasks.append(asyncio.create_task(serve_video(section, cameras, feed, *images, warn)))
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in done:
+            task.result()
     finally:
         client.ending.set()
         feed.close()

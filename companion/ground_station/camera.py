@@ -158,6 +158,13 @@ class Camera:
         self._definition_uri, self._definition_version = uri, version
         self.needs_definition, self._is_changed = False, True
 
+    def show_streams(self, streams: Sequence[VideoStream]) -> list[Message]:
+        """Use the streams that there are now; returns what stations are sent of new ones."""
+        is_new = len(streams) != len(self.streams)
+        self.streams = streams
+        self._is_changed |= is_new
+        return [*self._stream_information(0)] if is_new else []
+
     # --- the component -------------------------------------------------------------------------------
 
     def handle(self, message: Message, now_ns: int) -> Iterable[Message]:

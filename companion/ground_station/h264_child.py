@@ -74,7 +74,10 @@ def main(frames: BinaryIO) -> int:
     clients: set[Any] = set()
     server.connect("client-connected", _on_client, clients)
     if not server.attach(None):
-        say(f"cannot listen on {options['host']}:{options['port']}")
+        say(
+            f"no H.264: cannot listen on {options['host']}:{options['port']}, the port after that of "
+            "ground_station.video_listen: another program has it"
+        )
         return EXIT_PASSING
     say(f"ready {server.get_bound_port()} {encoder}")
     threading.Thread(target=_read, args=(frames, sources, Gst), daemon=True).start()

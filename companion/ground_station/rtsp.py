@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import os
 import re
 import secrets
 import socket
@@ -68,6 +69,11 @@ def announced_uri(host: str, port: int, path: str) -> str:
             f"{LONGEST_URI_BYTES}: a shorter ground_station.video_host, camera name or token is needed"
         )
     return uri
+
+
+def _reason(error: OSError) -> str:
+    """Return the system's text; asyncio replaces it with a longer one."""
+    return os.strerror(error.errno) if error.errno is not None and error.errno > 0 else str(error)
 
 
 def _address_towards(host: str) -> str:
@@ -144,7 +150,7 @@ class VideoServer:
             )
         except OSError as error:
             raise AddressTakenError(
-                f"cannot listen on {self.host}:{self.port}: {error.strerror or error}; "
+                f"cannot listen on {self.host}:{self.port}: {_reason(error)}; "
                 "ground_station.video_listen sets another address"
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+import asyncio
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -14,32 +14,34 @@ from companion.ground_station.component import Message
 from companion.ground_station.feed import BusFeed
 from companion.ground_station.gstreamer import H264Server
 from companion.ground_station.rtsp import VideoServer, announced_host, announced_uri
+from companion.host.passing import AddressTakenError
 from companion.settings.key_files import KeyFileError, read_token
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 
 LONGEST_DEFINITION_URI_BYTES = 139
 """Of CAMERA_INFORMATION, with a zero at its end."""
+_RETRY_S = 5.0
 
 
-@asynccontextmanager
-async def serving_video(
+async def serve_video(
     section: GroundStationSection,
     cameras: Sequence[Camera],
     feed: BusFeed,
     image_width: int,
     rate_hz: float,
     say: Callable[[str], None],
-) -> AsyncIterator[None]:
-    """Serve the cameras' video meanwhile, if `video_listen` is set. `image_width`, `rate_hz`: at most.
+) -> None:
+    """Serve the cameras' video until cancelled. While another program has its port, only video is missing.
+
+    Args:
+        section: with `url` and `video_listen`. image_width, rate_hz: at most.
 
     Raises:
         GroundStationError: the token is missing or not acceptable, or an address is too long to be announced.
-        AddressTakenError: another program has the port.
     """
-    if section.video_listen is None or section.url is None:
-        yield
-        return
+    assert section.video_listen is not None
+    assert section.url is not None
     try:
         name = "ground_station.video_token_file"
         token = None if section.video_token_file is None else read_token(section.video_token_file, name)
@@ -63,7 +65,12 @@ async def serving_video(
         on_wanted=partial(want, "RTP/JPEG"),
         say=say,
     )
-    await jpeg.start()
+    url = parse_link_url(section.url)
+    known = url.scheme in (LinkScheme.UDP_OUT, LinkScheme.TCP)
+    host = announced_host(jpeg.host, section.video_host, url.address[0] if known else "")
+    for path in jpeg.paths.values():
+        announced_uri(host, jpeg.port, path)
+    await _start(jpeg, say)
     h264 = H264Server(
         jpeg.host,
         jpeg.port + 1,
@@ -73,9 +80,6 @@ async def serving_video(
         say=say,
     )
     pushes |= {"RTP/JPEG": jpeg.push, "H.264": h264.push}
-    url = parse_link_url(section.url)
-    known = url.scheme in (LinkScheme.UDP_OUT, LinkScheme.TCP)
-    host = announced_host(jpeg.host, section.video_host, url.address[0] if known else "")
 
     def define(stream: str, camera: Camera, _now_ns: int) -> list[Message]:
         if camera.definition is None:
@@ -97,7 +101,7 @@ async def serving_video(
             )
         return []
 
-    def announce(stream: str, camera: Camera, _now_ns: int = 0) -> list[Message]:
+    def announce(stream: str, camera: Camera, _now_ns: int) -> list[Message]:
         width = min(camera.size[0], image_width)
         size = (width, round(camera.size[1] * width / camera.size[0])) if width else (0, 0)
         uri = announced_uri(host, jpeg.port, jpeg.paths[stream])
@@ -107,15 +111,26 @@ async def serving_video(
             found.append(
                 VideoStream(f"{stream} H.264", uri, size, mavlink.VIDEO_STREAM_ENCODING_H264, rate_hz)
             )
-        camera.streams = found
-        return []
+        return camera.show_streams(found)
 
     try:
         for stream, camera in streams.items():
-            announce(stream, camera)
             camera.sources += [partial(announce, stream, camera), partial(define, stream, camera)]
         await h264.start()
-        yield
+        await asyncio.Event().wait()
     finally:
         await h264.close()
         await jpeg.close()
+
+
+async def _start(server: VideoServer, say: Callable[[str], None]) -> None:
+    """Listen, however late the port is free."""
+    said = False
+    while True:
+        try:
+            return await server.start()
+        except AddressTakenError as error:
+            if not said:
+                say(f"no video until its port is free: {error}")
+            said = True
+            await asyncio.sleep(_RETRY_S)
