@@ -8,12 +8,11 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.bus.bodies.frames import CameraInfoBody, DetectionsBody
-from companion.bus.bodies.service import CommandStateBody, StatusBody
+from companion.bus.bodies.service import EventBody, StatusBody
 from companion.bus.bodies.vehicle import VehicleBody
 from companion.bus.child_client import LISTENING, ChildClient, run_child
 from companion.bus.topics import (
@@ -34,18 +33,14 @@ from companion.ground_station.link import StationLink
 from companion.ground_station.objects import Objects
 from companion.ground_station.parameters import Parameter, Parameters, definition
 from companion.ground_station.positions import Positions
-from companion.ground_station.reports import ComputerStatus, StatusTexts
+from companion.ground_station.reports import ComputerStatus, StatusTexts, reported_losses
 from companion.ground_station.tracking import FLAGS, Tracking
 from companion.ground_station.video import serve_video
-from companion.host.peer_data import parse_object
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import parse_link_url
 from companion.vehicle.signing import FrameSigner, read_key
 from vision.home import expanded
-
-_EVENTS_KEPT = 256
-_REPORT_NS = 10_000_000_000
 
 
 def _work(client: ChildClient) -> None:
@@ -69,7 +64,6 @@ async def _run(client: ChildClient) -> None:
     cameras[0].sources += [texts.due, computer.due]
     feed = BusFeed(client, options["vehicle"])
     _subscribe(feed, cameras, texts)
-    cameras[0].sources.append(_report_losses(feed, texts, client.say))
     trackings = []
     for camera, about in zip(cameras, options["cameras"], strict=False):
         trackings.append(_track(feed, camera, about, texts, section))
@@ -87,6 +81,17 @@ async def _run(client: ChildClient) -> None:
         say=warn,
         on_standstill=on_standstill,
     )
+    lost = {
+        "messages of the bus left out: this computer is too slow, or they are of another version": lambda: (
+            feed.dropped
+        ),
+        "warnings for stations left out: they were too many": lambda: texts.lost,
+        "requests of stations left out: they were too many": lambda: link.dropped,
+        "messages of stations refused: not signed, or not with the key of vehicle.signing_key_file": lambda: (
+            link.refused
+        ),
+    }
+    cameras[0].sources.append(reported_losses(lost, client.say))
     open_parts: set[str] = set()
 
     def on_open(part: str) -> None:
@@ -136,43 +141,20 @@ def _cameras(options: dict[str, Any], directory: Path | None, warn: Callable[[st
 
 
 def _subscribe(feed: BusFeed, cameras: list[Camera], texts: StatusTexts) -> None:
-    def on_status(_payload: bytes, _attachment: bytes | None) -> None:
-        for camera in cameras:
-            camera.on_status(time.monotonic_ns())
-
-    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
-        body = cast("VehicleBody", parse_object(payload))
-        for camera in cameras:
-            camera.positions.on_vehicle(body)
-
-    def on_event(payload: bytes, _attachment: bytes | None) -> None:
-        event = parse_object(payload)
+    def on_event(event: EventBody) -> None:
         texts.on_event(event["level"], event["text"], event["stamp_ns"], time.monotonic_ns())
 
-    feed.subscribe(STATUS, None, on_status)
-    feed.subscribe(VEHICLE, None, on_vehicle)
-    feed.subscribe(EVENTS, None, on_event, _EVENTS_KEPT)
+    feed.subscribe(EVENTS, None, on_event)
     for camera in cameras:
-        feed.subscribe(CAMERA_INFO, camera.name, partial(_on_camera_info, camera))
-        feed.subscribe(TRANSFORMS, camera.name, partial(_on_transforms, camera))
+        feed.subscribe(STATUS, None, partial(_on_status, camera))
+        feed.subscribe(VEHICLE, None, camera.positions.on_vehicle)
+        feed.subscribe(CAMERA_INFO, camera.name, camera.on_camera_info)
+        feed.subscribe(TRANSFORMS, camera.name, camera.positions.on_transforms)
         camera.sources.append(_images_while_wanted(feed, camera))
 
 
-def _report_losses(
-    feed: BusFeed, texts: StatusTexts, say: Callable[[str], None]
-) -> Callable[[int], list[Message]]:
-    reported, next_ns = (0, 0), 0
-
-    def due(now_ns: int) -> list[Message]:
-        nonlocal reported, next_ns
-        lost = feed.dropped, texts.lost
-        if lost != reported and now_ns >= next_ns:
-            messages, warnings = (new - old for new, old in zip(lost, reported, strict=True))
-            say(f"left out: {messages} messages of the bus, {warnings} warnings for stations")
-            reported, next_ns = lost, now_ns + _REPORT_NS
-        return []
-
-    return due
+def _on_status(camera: Camera, _status: StatusBody) -> None:
+    camera.on_status(time.monotonic_ns())
 
 
 def _track(
@@ -192,23 +174,13 @@ def _track(
     camera.flags |= FLAGS
     camera.sources += [tracking.due, Objects(tracking, target_relative=section.target_relative).due]
 
-    def on_status(payload: bytes, _attachment: bytes | None) -> None:
-        tracking.on_service(cast("StatusBody", parse_object(payload))["service"])
-
-    def on_detections(payload: bytes, _attachment: bytes | None) -> None:
-        tracking.on_detections(cast("DetectionsBody", parse_object(payload)))
-
-    def on_command_state(payload: bytes, _attachment: bytes | None) -> None:
-        tracking.on_command_state(cast("CommandStateBody", parse_object(payload)))
+    def on_status(status: StatusBody) -> None:
+        tracking.on_service(status["service"])
 
     feed.subscribe(STATUS, None, on_status)
-    feed.subscribe(DETECTIONS, camera.name, on_detections)
-
-    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
-        tracking.on_vehicle(cast("VehicleBody", parse_object(payload)))
-
-    feed.subscribe(VEHICLE, None, on_vehicle)
-    feed.subscribe(COMMAND_STATE, None, on_command_state, _EVENTS_KEPT)
+    feed.subscribe(VEHICLE, None, tracking.on_vehicle)
+    feed.subscribe(DETECTIONS, camera.name, tracking.on_detections)
+    feed.subscribe(COMMAND_STATE, None, tracking.on_command_state)
     return tracking
 
 
@@ -235,27 +207,16 @@ def _offer_parameters(
             camera.definition = definition(camera.label, described)
         return parameters.due(now_ns)
 
-    def on_status(payload: bytes, _attachment: bytes | None) -> None:
-        parameters.on_status(cast("StatusBody", parse_object(payload)))
-
-    def on_vehicle(payload: bytes, _attachment: bytes | None) -> None:
-        parameters.on_vehicle(cast("VehicleBody", parse_object(payload)), time.monotonic_ns())
+    def on_vehicle(vehicle: VehicleBody) -> None:
+        parameters.on_vehicle(vehicle, time.monotonic_ns())
 
     camera.sources.append(due)
-    feed.subscribe(STATUS, None, on_status)
+    feed.subscribe(STATUS, None, parameters.on_status)
     feed.subscribe(VEHICLE, None, on_vehicle)
 
 
 def _say(texts: StatusTexts, severity: int, text: str) -> None:
     texts.add(severity, text, time.monotonic_ns())
-
-
-def _on_camera_info(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:
-    camera.on_camera_info(cast("CameraInfoBody", parse_object(payload)))
-
-
-def _on_transforms(camera: Camera, payload: bytes, _attachment: bytes | None) -> None:
-    camera.positions.on_transforms(payload)
 
 
 def _images_while_wanted(feed: BusFeed, camera: Camera) -> Callable[[int], list[Message]]:

@@ -34,7 +34,7 @@ OLD_REQUESTS: dict[int, tuple[int, int | None]] = {
 # A repeated command arrives within this time; QGroundControl repeats after 3 s.
 _REPEATED_NS = 10 * _S
 _MOST_SENDERS = 64
-_SHORTEST_INTERVAL_US = 50_000
+SHORTEST_INTERVAL_NS = 50_000_000
 
 
 class Component(Protocol):
@@ -81,6 +81,31 @@ class Answer:
     messages: Sequence[Message] = ()
 
 
+class Stream:
+    """Sends a message at an interval, once for each frame. `interval_ns`: the default; None: not at all."""
+
+    def __init__(self, interval_ns: int | None, shortest_ns: int = SHORTEST_INTERVAL_NS) -> None:
+        self._default_ns = self.interval_ns = interval_ns
+        self._shortest_ns = shortest_ns
+        self._next_ns, self._sequence = 0, -1
+
+    def set_interval(self, interval_us: int) -> None:
+        """Set it as MAV_CMD_SET_MESSAGE_INTERVAL does: -1 ends it, 0 is the default."""
+        if interval_us < 0:
+            self.interval_ns = None
+        else:
+            self.interval_ns = max(interval_us * 1000, self._shortest_ns) if interval_us else self._default_ns
+
+    def is_due(self, now_ns: int, sequence: int | None) -> bool:
+        """Whether to send now. `sequence`: of the frame; None: it is about none."""
+        if self.interval_ns is None or now_ns < self._next_ns or sequence == self._sequence:
+            return False
+        late = now_ns - self._next_ns > self.interval_ns
+        self._next_ns = (now_ns if late else self._next_ns) + self.interval_ns
+        self._sequence = -1 if sequence is None else sequence
+        return True
+
+
 class RequestTable:
     """Answers commands and requests for messages.
 
@@ -89,6 +114,7 @@ class RequestTable:
         replies: message id → what makes it. Its argument is the number of a stream, storage or image, 0 for
             all or where there is none; nothing is returned for a number that does not exist.
         listeners: type of another message, such as PARAM_EXT_SET → what answers it.
+        streams: message id → when its sender, not this class, sends it.
     """
 
     def __init__(self) -> None:
@@ -98,7 +124,8 @@ class RequestTable:
         self.replies: dict[int, Callable[[int], Sequence[Message]]] = {}
         self.listeners: dict[str, Callable[[Message], Iterable[Message]]] = {}
         self._executed: dict[tuple[Address, int], tuple[Command, int]] = {}  # with its result
-        self._streams: dict[int, tuple[int, int]] = {}  # message id → interval and next time, nanoseconds
+        self.streams: dict[int, Stream] = {}
+        self._timed: dict[int, Stream] = {}
 
     def handle(self, message: Message, now_ns: int) -> list[Message]:
         """Return the answer to a message. A command has an acknowledgement, then the messages asked for.
@@ -128,13 +155,8 @@ class RequestTable:
 
     def due(self, now_ns: int) -> list[Message]:
         """Return the messages whose interval has passed."""
-        messages: list[Message] = []
-        for message_id, (interval_ns, next_ns) in self._streams.items():
-            if now_ns >= next_ns:
-                late = now_ns - next_ns > interval_ns  # after a pause: without catching up
-                self._streams[message_id] = interval_ns, (now_ns if late else next_ns) + interval_ns
-                messages += self.replies[message_id](0)
-        return messages
+        due = [message_id for message_id, stream in self._timed.items() if stream.is_due(now_ns, None)]
+        return [message for message_id in due for message in self.replies[message_id](0)]
 
     def _answer(self, command: Command) -> Answer:
         if command.number == mavlink.MAV_CMD_REQUEST_MESSAGE:
@@ -166,15 +188,12 @@ class RequestTable:
         return Answer(ACCEPTED, messages) if messages else Answer(DENIED)
 
     def _set_interval(self, command: Command) -> Answer:
-        """MAV_CMD_SET_MESSAGE_INTERVAL: -1 ends the stream, 0 is the default, which is none."""
-        message_id, interval_us = command.whole(0), command.whole(1)
-        if message_id not in self.replies:
+        """Execute MAV_CMD_SET_MESSAGE_INTERVAL."""
+        message_id = command.whole(0)
+        if message_id not in self.streams and message_id not in self.replies:
             return Answer(UNSUPPORTED)
-        if interval_us <= 0:
-            self._streams.pop(message_id, None)
-        else:
-            interval_ns = max(interval_us, _SHORTEST_INTERVAL_US) * 1000
-            self._streams[message_id] = interval_ns, command.received_ns
+        stream = self.streams.get(message_id) or self._timed.setdefault(message_id, Stream(None))
+        stream.set_interval(command.whole(1))
         return Answer()
 
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import queue
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from threading import Lock, Thread
 from typing import Any
 
@@ -25,12 +26,15 @@ from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 
 OnMessage = Callable[[bytes, bytes | None], None]
 """Called in the loop with payload and attachment."""
+OnBody = Callable[[Any], None]
+"""Called in the loop with the body of a message, parsed."""
 OnReply = Callable[[Mapping[str, Any]], None]
 """Called in the loop with a reply: `success`, and `reason` where there is none."""
 OnImage = Callable[[bytes, int], None]
 """Called in the loop with a JPEG and its `captured_ns`."""
 
-_IMAGES_KEPT = 2
+# Messages that may wait for the loop; of cached topics, each of which matters, and of others.
+_CACHED_KEPT, _OTHERS_KEPT, _IMAGES_KEPT = 256, 16, 2
 _POLL_S = 0.5
 # A click that the service answers later flies nothing.
 _ANSWER_S = 5.0
@@ -48,14 +52,14 @@ class BusFeed:
         self.dropped = 0
         self._client, self._vehicle = client, vehicle
         self._loop = asyncio.get_running_loop()
-        self._topics: list[tuple[Topic, str | None, OnMessage, int]] = []
+        self._listeners: dict[str, tuple[Topic, list[OnBody]]] = {}
         self._users: dict[str | None, dict[str, OnImage]] = {}
         self._changes: queue.SimpleQueue[tuple[str | None, bool] | None] = queue.SimpleQueue()
         self._session: zenoh.Session | None = None
 
-    def subscribe(self, topic: Topic, camera: str | None, on_message: OnMessage, kept: int = 16) -> None:
-        """Subscribe to a topic, before `run`. `kept`: messages that may wait for the loop."""
-        self._topics.append((topic, camera, on_message, kept))
+    def subscribe(self, topic: Topic, camera: str | None, on_body: OnBody) -> None:
+        """Subscribe to a topic of JSON, before `run`."""
+        self._listeners.setdefault(topic.key(self._vehicle, camera), (topic, []))[1].append(on_body)
 
     def want_images(self, camera: str | None, user: str, on_image: OnImage | None) -> None:
         """Begin to give the images of a camera to a user, or end it (None)."""
@@ -127,7 +131,10 @@ class BusFeed:
             if session is None:
                 return
             self._session = session
-            kept = [self._declare(session, *each) for each in self._topics]
+            kept = []
+            for key, (topic, listeners) in self._listeners.items():
+                most = _CACHED_KEPT if topic.cached else _OTHERS_KEPT
+                kept.append(self._declare(session, topic, key, partial(self._on_json, listeners), most))
             self._loop.call_soon_threadsafe(on_open)
             images: dict[str | None, Any] = {}
             while not self._client.ending.is_set():
@@ -140,7 +147,8 @@ class BusFeed:
                 camera, wanted = change
                 if wanted:
                     receive = self._image_receiver(camera)
-                    images[camera] = self._declare(session, IMAGE, camera, receive, _IMAGES_KEPT)
+                    key = IMAGE.key(self._vehicle, camera)
+                    images[camera] = self._declare(session, IMAGE, key, receive, _IMAGES_KEPT)
                 else:
                     images.pop(camera).undeclare()
             self._session = None
@@ -149,6 +157,14 @@ class BusFeed:
     def close(self) -> None:
         """End `run`."""
         self._changes.put(None)
+
+    def _on_json(self, listeners: Sequence[OnBody], payload: bytes, _attachment: bytes | None) -> None:
+        body = parse_object(payload)
+        for on_body in listeners:
+            try:
+                on_body(body)
+            except (ValueError, KeyError, TypeError):  # of another version
+                self.dropped += 1
 
     def _image_receiver(self, camera: str | None) -> OnMessage:
         def on_message(jpeg: bytes, attachment: bytes | None) -> None:
@@ -159,7 +175,7 @@ class BusFeed:
         return on_message
 
     def _declare(
-        self, session: zenoh.Session, topic: Topic, camera: str | None, on_message: OnMessage, kept: int
+        self, session: zenoh.Session, topic: Topic, key: str, on_message: OnMessage, kept: int
     ) -> Any:
         waiting: deque[tuple[bytes, bytes | None]] = deque()
         lock, scheduled = Lock(), False
@@ -189,8 +205,8 @@ class BusFeed:
             for payload, attachment in messages:
                 try:
                     on_message(payload, attachment)
-                except (ValueError, KeyError, TypeError):  # of another version
+                except (ValueError, KeyError, TypeError):
                     self.dropped += 1
 
         subscribe = subscribe_kept if topic.cached else zenoh.Session.declare_subscriber
-        return subscribe(session, topic.key(self._vehicle, camera), on_sample)
+        return subscribe(session, key, on_sample)

@@ -30,7 +30,6 @@ from companion.vehicle.signing import FrameSigner
 TICK_S = 0.05
 # In one tick; more wait, and of these the oldest are left out.
 _BATCH, _MOST_WAITING = 16, 256
-_REPORT_NS = 10_000_000_000
 _GONE_NS = 5_000_000_000
 _HEARTBEAT_ID = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 _REQUEST_IDS = {
@@ -56,7 +55,7 @@ class StationLink:
             what waited on the link has been left out.
 
     Attributes:
-        components: those that have an id. dropped: requests that were left out.
+        components: those that have an id. dropped: requests that were too many.
     """
 
     def __init__(
@@ -84,8 +83,11 @@ class StationLink:
         self._peer_ns = 0
         self._allowance = 0  # requests that this tick still allows
         self._other_vehicle: int | None = None
-        self._reported: tuple[int, int] = (0, 0)
-        self._report_ns = time.monotonic_ns()
+
+    @property
+    def refused(self) -> int:
+        """Messages that signing refused."""
+        return 0 if self._signer is None else sum(self._signer.refused.values())
 
     async def run(self, on_open: Callable[[], None]) -> None:
         """Open the link and serve it until cancelled.
@@ -232,9 +234,6 @@ class StationLink:
         self._handle(now_ns)
         for component in tuple(self.components):
             self._send_all(component, partial(component.due, now_ns))
-        if now_ns - self._report_ns >= _REPORT_NS:
-            self._report_ns = now_ns
-            self._report()
 
     def _send_all(self, component: Component, messages: Callable[[], Iterable[Message]]) -> None:
         """Send what a component returns. A fault in one answer must not end the others."""
@@ -243,13 +242,3 @@ class StationLink:
                 self.send(component.component_id, message)
         except Exception as error:
             self._say(f"camera {component.component_id}: {error_text(error)}")
-
-    def _report(self) -> None:
-        """Say what was refused or left out since the last report."""
-        refused = 0 if self._signer is None else sum(self._signer.refused.values())
-        before, self._reported = self._reported, (self.dropped, refused)
-        if self.dropped > before[0]:
-            self._say(f"{self.dropped - before[0]} requests of stations left out: they were too many")
-        if refused > before[1] and self._signer is not None:
-            reasons = ", ".join(sorted(self._signer.refused))
-            self._say(f"{refused - before[1]} messages refused by signing: {reasons}")

@@ -24,8 +24,8 @@ from typing import Any, ClassVar
 from pymavlink.dialects.v20 import common as mavlink
 
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
-from companion.ground_station.component import Message
-from companion.ground_station.tracking import Stream, Tracking
+from companion.ground_station.component import Message, Stream
+from companion.ground_station.tracking import Tracking
 from companion.vehicle.framing import CRC_EXTRA, TARGET_RELATIVE_ID
 
 # Above 32767: not registered with MAVLink.

@@ -6,14 +6,14 @@ import math
 from bisect import bisect
 from collections import deque
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import cast
 
 import numpy as np
 
+from companion.bus.bodies.frames import TransformBody, TransformsBody
 from companion.bus.bodies.vehicle import VehicleBody
-from companion.host.peer_data import PeerDataError, parse_object
+from vision.attitude import Quaternion
 from vision.rotation import BODY_FROM_OPTICAL, matrix_from_quaternion, quaternion_from_matrix
 
 _VEHICLE_KEPT, _FRAMES_KEPT = 50, 64  # 5 s at 10 Hz; some seconds of frames
@@ -37,7 +37,7 @@ class Positions:
 
     def __init__(self) -> None:
         self._vehicle: deque[tuple[int, Place]] = deque(maxlen=_VEHICLE_KEPT)
-        self._frames: deque[bytes] = deque(maxlen=_FRAMES_KEPT)
+        self._frames: deque[TransformsBody] = deque(maxlen=_FRAMES_KEPT)
 
     def on_vehicle(self, body: VehicleBody) -> None:
         """Keep a message of the topic `vehicle`."""
@@ -50,9 +50,9 @@ class Positions:
             heights = (math.nan if height is None else height for height in (amsl_m, altitude_m))
             self._vehicle.append((stamp_ns, Place(latitude, longitude, *heights)))
 
-    def on_transforms(self, payload: bytes) -> None:
-        """Keep a message of the topic `transforms` of the camera; it is parsed only when it is needed."""
-        self._frames.append(payload)
+    def on_transforms(self, body: TransformsBody) -> None:
+        """Keep a message of the topic `transforms` of the camera."""
+        self._frames.append(body)
 
     def place(self, stamp_ns: int) -> Place | None:
         """Return where the vehicle was, interpolated; None: not known at that time."""
@@ -80,13 +80,9 @@ class Positions:
             Quaternion w, x, y, z that rotates the camera's axes (forward, right, down) into NED; None: not
             known.
         """
-        for payload in reversed(self._frames):
-            if captured_ns is not None and b"%d" % captured_ns not in payload:
-                continue
-            with suppress(PeerDataError, KeyError, TypeError, ValueError):
-                body = parse_object(payload)
-                if captured_ns in (None, body["captured_ns"]):
-                    return _orientation(body["transforms"])
+        for body in reversed(self._frames):
+            if captured_ns in (None, body["captured_ns"]):
+                return _orientation(body["transforms"])
         return None
 
 
@@ -94,8 +90,8 @@ def _values(place: Place) -> tuple[float, ...]:
     return (place.latitude_deg, place.longitude_deg, place.altitude_amsl_m, place.altitude_m)
 
 
-def _orientation(transforms: Sequence[dict[str, Any]]) -> Sequence[float]:
+def _orientation(transforms: Sequence[TransformBody]) -> Sequence[float]:
     rotation = np.eye(3)
     for each in transforms:
-        rotation = rotation @ matrix_from_quaternion(each["rotation_wxyz"])
+        rotation = rotation @ matrix_from_quaternion(cast("Quaternion", each["rotation_wxyz"]))
     return quaternion_from_matrix(rotation @ BODY_FROM_OPTICAL.T)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TypeVar
 
@@ -21,8 +21,9 @@ _CHUNK_BYTES, _LONGEST_BYTES = 50, 400
 _SEVERITIES = {"warning": mavlink.MAV_SEVERITY_WARNING, "error": mavlink.MAV_SEVERITY_ERROR}
 # An event of before the start of this process, which the bus has kept, is no news.
 _OLDEST_NS = 30 * _S
-# Lines of this process, which adds them directly; and texts that the autopilot itself has sent.
-_NO_NEWS = ("ground_station: ", "autopilot: ")
+# Lines of this process, and why a click failed, which it adds directly; texts that the autopilot has sent.
+_NO_NEWS = ("ground_station: ", "select ", "follow track=", "autopilot: ")
+_LOSSES_NS = 10 * _S
 T = TypeVar("T")
 # "Unknown" of ONBOARD_COMPUTER_STATUS.
 _U8, _U32, _I8, _I16 = 0xFF, 0xFFFF_FFFF, 0x7F, 0x7FFF
@@ -92,6 +93,25 @@ def chunks_of(text: str) -> list[bytes]:
     if chunks and len(chunk) == _CHUNK_BYTES:  # the last chunk of several ends with a zero
         return [*chunks, chunk, b""]
     return [*chunks, chunk]
+
+
+def reported_losses(
+    counts: Mapping[str, Callable[[], int]], say: Callable[[str], None]
+) -> Callable[[int], Iterable[Message]]:
+    """Return a source that says every 10 s which counts have risen. `counts`: what was lost, and why."""
+    reported, next_ns = dict.fromkeys(counts, 0), 0
+
+    def due(now_ns: int) -> Iterable[Message]:
+        nonlocal next_ns
+        if now_ns >= next_ns:
+            next_ns = now_ns + _LOSSES_NS
+            for what, count in counts.items():
+                if (lost := count()) > reported[what]:
+                    say(f"{lost - reported[what]} {what}")
+                    reported[what] = lost
+        return []
+
+    return due
 
 
 class ComputerStatus:

@@ -20,7 +20,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.bus.bodies.service import CommandStateBody
 from companion.bus.bodies.vehicle import VehicleBody
-from companion.ground_station.component import Answer, Command, Message, RequestTable
+from companion.ground_station.component import Answer, Command, Message, RequestTable, Stream
 from companion.host.clock import PAUSED_S
 from companion.vehicle.gimbal import Address
 from vision.tracking import TARGET_CLASS
@@ -55,7 +55,7 @@ _WARNING, _INFO = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
 _NAN, _UNKNOWN_E7 = math.nan, 2**31 - 1
 
 _MS = 1_000_000
-IMAGE_INTERVAL_NS, SHORTEST_INTERVAL_NS = 100 * _MS, 50 * _MS
+IMAGE_INTERVAL_NS = 100 * _MS
 MAX_AGE_NS, LATE_NS, LOST_NS = 140 * _MS, 100 * _MS, 400 * _MS
 """A box is not sent so long after its capture, so that a station gets none older than 150 ms; where frames
 usually take more than `LATE_NS` to their publication, `LATE_NS` after it. `LOST_NS` later, as a camera may
@@ -176,31 +176,6 @@ class _Request:
         )
 
 
-class Stream:
-    """Sends a message at an interval, once for each frame. `interval_ns`: the default; None: not at all."""
-
-    def __init__(self, interval_ns: int | None, shortest_ns: int = SHORTEST_INTERVAL_NS) -> None:
-        self._default_ns = self.interval_ns = interval_ns
-        self._shortest_ns = shortest_ns
-        self._next_ns, self._sequence = 0, -1
-
-    def set_interval(self, interval_us: int) -> None:
-        """Set it as MAV_CMD_SET_MESSAGE_INTERVAL does: -1 ends it, 0 is the default."""
-        if interval_us < 0:
-            self.interval_ns = None
-        else:
-            self.interval_ns = max(interval_us * 1000, self._shortest_ns) if interval_us else self._default_ns
-
-    def is_due(self, now_ns: int, sequence: int | None) -> bool:
-        """Whether to send now. `sequence`: of the frame; None: it is about none."""
-        if self.interval_ns is None or now_ns < self._next_ns or sequence == self._sequence:
-            return False
-        late = now_ns - self._next_ns > self.interval_ns
-        self._next_ns = (now_ns if late else self._next_ns) + self.interval_ns
-        self._sequence = -1 if sequence is None else sequence
-        return True
-
-
 class Tracking:
     """The tracking of one camera.
 
@@ -232,7 +207,8 @@ class Tracking:
         self._max_age_s = max_age_s
         self._steers, self._follows, self._send, self._say = steers, follows, send, say
         self.selection: Selection | None = None
-        self.streams = {IMAGE_STATUS: Stream(IMAGE_INTERVAL_NS), GEO_STATUS: Stream(None)}
+        self.streams = requests.streams
+        self.streams |= {IMAGE_STATUS: Stream(IMAGE_INTERVAL_NS), GEO_STATUS: Stream(None)}
         self.newest: DetectionsBody | None = None
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
         self._now_ns = self._idle_until_ns = 0
@@ -245,12 +221,10 @@ class Tracking:
         self._open: dict[str, tuple[str, int]] = {}  # id of a command that has not ended → text, time
         self._ended = ""  # id of the one that has ended last
         self._service: str | None = None
-        self._set_interval = requests.actions[mavlink.MAV_CMD_SET_MESSAGE_INTERVAL]
         requests.actions |= {
             mavlink.MAV_CMD_CAMERA_TRACK_POINT: self._on_track,
             mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: self._on_track,
             mavlink.MAV_CMD_CAMERA_STOP_TRACKING: self._on_stop,
-            mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._on_interval,
         }
         requests.replies |= {
             IMAGE_STATUS: lambda _: [self._image_status()],
@@ -325,13 +299,6 @@ class Tracking:
             if self.streams[message_id].is_due(now_ns, sequence):
                 messages.append(make())
         return messages
-
-    def _on_interval(self, command: Command) -> Answer:
-        stream = self.streams.get(command.whole(0))
-        if stream is None:
-            return self._set_interval(command)
-        stream.set_interval(command.whole(1))
-        return Answer()
 
     def _on_track(self, command: Command) -> Answer:
         self._now_ns = command.received_ns

@@ -128,9 +128,13 @@ async def _start(server: VideoServer, say: Callable[[str], None]) -> None:
     said = False
     while True:
         try:
-            return await server.start()
+            await server.start()
         except AddressTakenError as error:
             if not said:
                 say(f"no video until its port is free: {error}")
             said = True
             await asyncio.sleep(_RETRY_S)
+        else:
+            if said:
+                say(f"video is served now, at {server.host}:{server.port}")
+            return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -227,8 +228,8 @@ def test_photo_is_a_file_and_a_message_with_its_place(harness: CameraHarness, tm
     harness.positions.on_vehicle(vehicle_body(at_ns - S // 20, 47.0, 10.0))
     harness.positions.on_vehicle(vehicle_body(at_ns + S // 20, 47.002, 20.0))
     half = math.sqrt(0.5)
-    turned = '{"captured_ns":%d,"transforms":[{"rotation_wxyz":[%r,0,0,%r]}]}' % (at_ns, half, half)  # noqa: UP031
-    harness.positions.on_transforms(turned.encode())
+    turned: Any = {"captured_ns": at_ns, "transforms": [{"rotation_wxyz": [half, 0.0, 0.0, half]}]}
+    harness.positions.on_transforms(turned)
     assert take_photo(harness, 0, 1) == mavlink.MAV_RESULT_ACCEPTED
     assert harness.captures.is_wanted
     harness.captures.on_image(b"before the command", harness.now_ns - 1, harness.now_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.ground_station.reports import ComputerStatus, StatusTexts, chunks_of
+from companion.ground_station.reports import ComputerStatus, StatusTexts, chunks_of, reported_losses
 from tests.companion.ground_station.station_harness import S, received
 
 
@@ -36,6 +37,7 @@ def test_old_events_and_lines_of_its_own_are_not_sent() -> None:
     texts.on_event("warning", "of before the start", 10 * S, 100 * S)
     texts.on_event("warning", "ground_station: said directly", 100 * S, 100 * S)
     texts.on_event("warning", "autopilot: said by itself", 100 * S, 100 * S)
+    texts.on_event("warning", "select x=0.1 y=0.1: its click says why", 100 * S, 100 * S)
     assert texts_of(texts, 100 * S) == []
 
 
@@ -47,6 +49,15 @@ def test_five_at_once_then_one_a_second_and_the_rest_is_counted() -> None:
     sent = sum(len(texts_of(texts, 100 * S + tick * S // 20)) for tick in range(1, 200))
     assert sent == 9
     assert texts.lost == 20
+
+
+def test_losses_are_said_every_ten_seconds_if_there_are_more() -> None:
+    counts, lines = {"lost": 0, "late": 0}, list[str]()
+    due = reported_losses({what: partial(counts.__getitem__, what) for what in counts}, lines.append)
+    for second, lost in ((0, 2), (5, 5), (9, 6), (10, 7), (20, 7)):
+        counts["lost"] = lost
+        assert due(second * S) == []
+    assert lines == ["2 lost", "5 lost"]
 
 
 def test_same_text_is_sent_every_ten_seconds() -> None:
