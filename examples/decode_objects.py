@@ -16,9 +16,9 @@ HEADER, OBJECT = struct.Struct("<2sBBBBH"), struct.Struct("<IBB4HiiiB")
 
 def decode(payload: bytes) -> Iterator[dict[str, Any]]:
     """Yield the objects of one payload of TUNNEL."""
-    magic, version, number, total, _first, age_ms = HEADER.unpack_from(payload)
-    if (magic, version) != (b"CO", 1):
+    if len(payload) < HEADER.size or payload[:3] != b"CO\x01":  # version 1
         return
+    _magic, _version, number, total, _first, age_ms = HEADER.unpack_from(payload)
     at = HEADER.size
     while at < len(payload):
         track, flags, confidence, *rest, length = OBJECT.unpack_from(payload, at)

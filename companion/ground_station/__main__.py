@@ -81,17 +81,19 @@ async def _run(client: ChildClient) -> None:
         say=warn,
         on_standstill=on_standstill,
     )
-    lost = {
+    lost_here = {
         "messages of the bus left out: this computer is too slow, or they are of another version": lambda: (
             feed.dropped
         ),
         "warnings for stations left out: they were too many": lambda: texts.lost,
+    }
+    lost_of_stations = {
         "requests of stations left out: they were too many": lambda: link.dropped,
         "messages of stations refused: not signed, or not with the key of vehicle.signing_key_file": lambda: (
             link.refused
         ),
     }
-    cameras[0].sources.append(reported_losses(lost, client.say))
+    cameras[0].sources += [reported_losses(lost_here, client.say), reported_losses(lost_of_stations, warn)]
     open_parts: set[str] = set()
 
     def on_open(part: str) -> None:
@@ -171,7 +173,8 @@ def _track(
         send=feed.send_command,
         say=partial(_say, texts),
     )
-    camera.flags |= FLAGS
+    if about["tracks"]:  # `select` needs it
+        camera.flags |= FLAGS
     camera.sources += [tracking.due, Objects(tracking, target_relative=section.target_relative).due]
 
     def on_status(status: StatusBody) -> None:

@@ -219,12 +219,14 @@ class _Video:
     def __init__(self, path: Path, rate_hz: float) -> None:
         self._path, self._rate_hz = path, rate_hz
         self._writer: VideoWriter | None = None
+        self._damaged = 0
         self.failed = False
 
     def write(self, jpeg: bytes, captured_ns: int) -> None:
         _check_space(self._path)
         image = decode_image(jpeg)
         if image is None:
+            self._damaged += 1
             return
         if self._writer is None:
             height, width = image.shape[:2]
@@ -235,6 +237,8 @@ class _Video:
         if self._writer is None:
             raise VideoWriterError(f"{self._path}: there was no image for it")
         self._writer.close()
+        if self._damaged:
+            raise VideoWriterError(f"{self._path}: without {self._damaged} images, which are damaged")
 
 
 def _write(path: Path, jpeg: bytes) -> None:

@@ -159,6 +159,7 @@ def _ground_station_options(settings: Settings) -> dict[str, Any]:
                 "steers": name == settings.guidance.camera,
                 "max_age_s": camera.tracker.max_age_s,
                 "detects": camera.detector.enabled,
+                "tracks": camera.detector.enabled and camera.tracker.enabled,
             }
             for name, camera in cameras.items()
         ],

@@ -94,3 +94,20 @@ def test_video_without_an_image_is_reported(tmp_path: Path) -> None:
     harness.captures._executor.submit(lambda: None).result()
     harness.due()
     assert len(harness.warnings) == 1
+
+
+def test_damaged_images_of_a_video_are_reported_at_its_end(tmp_path: Path) -> None:
+    harness = CameraHarness(tmp_path)
+    harness.ask(command_long(mavlink.MAV_CMD_VIDEO_START_CAPTURE))
+    for data in (jpeg(), jpeg()[:40], b"", jpeg()):
+        harness.captures.on_image(data, harness.now_ns, harness.now_ns)
+        harness.captures._executor.submit(lambda: None).result()
+        harness.due()
+        harness.now_ns += S // 10
+    assert harness.warnings == []
+    harness.ask(command_long(mavlink.MAV_CMD_VIDEO_STOP_CAPTURE))
+    harness.captures._executor.submit(lambda: None).result()
+    harness.due()
+    (file,) = (tmp_path / "videos").glob("*.webm")
+    (warning,) = harness.warnings
+    assert f"{file}: without 2 images" in warning

@@ -94,6 +94,11 @@ def test_ten_surest_of_many_are_sent() -> None:
     assert decoded(encode(frame(), 1, NOW_NS)) == []
 
 
+@pytest.mark.parametrize("payload", [b"", b"CO", b"CO\x02" + bytes(5), b"XX\x01" + bytes(40)])
+def test_payload_of_others_has_no_objects(payload: bytes) -> None:
+    assert decoded([payload]) == []
+
+
 def test_object_has_its_fused_position_and_flags() -> None:
     seen = detection(7, (0, 0, 320, 480), object_id=3)
     known = tracked_object(3, [7], ambiguous=True)
