@@ -346,17 +346,22 @@ def speed_mps(vehicle: dict[str, Any]) -> float:
 
 
 @pytest.mark.parametrize("ros", JAZZY)
-def test_cmd_vel_steers_and_half_a_second_of_silence_brakes(
+def test_cmd_vel_steers_silence_brakes_and_a_killed_node_is_one_event(
     ros: str, filming: list[str], tmp_path: Path
 ) -> None:
     with (
         running_simulator(ready_after=0.0) as simulator,
         running_service(simulator.onboard_port, filming, cwd=tmp_path) as service,
-        running_node(ros, service.endpoint, vehicle="vehicle1"),
+        running_node(ros, service.endpoint, vehicle="vehicle1") as node,
         ros_peer(ros) as peer,
         service.client() as session,
     ):
         service.take_off(3.0)
+        events: queue.SimpleQueue[str] = queue.SimpleQueue()
+        listening = session.declare_subscriber(
+            "companion/vehicle1/events",
+            lambda sample: events.put(parse_object(sample.payload.to_bytes())["text"]),
+        )
         states: list[dict[str, Any]] = []
         subscriber = session.declare_subscriber(
             "companion/vehicle1/vehicle",
@@ -373,8 +378,18 @@ def test_cmd_vel_steers_and_half_a_second_of_silence_brakes(
             assert time.monotonic() < deadline_s
             time.sleep(0.05)
         slower = next(state for state in states if state["stamp_ns"] > silent_ns and speed_mps(state) < 1.5)
+        noted, earlier = len(node.lines), events.qsize()
+        os.kill(process_of_node(node), signal.SIGKILL)
+        node.wait_for_line("node: up: /vehicle1/companion", after=noted)
+        killed = [events.get(timeout=WAIT_S) for _ in range(earlier + 1)][earlier:]
+        peer.publish("/vehicle1/cmd_vel", TWIST, twist(2.0), times=60, hz=20.0)
+        peer.wait_for(lambda line: "published" in line)
+        assert max(speed_mps(state) for state in states[-20:]) > 1.5  # the same command `velocity`
+        killed += [events.get() for _ in range(events.qsize())]
+        listening.undeclare()  # type: ignore[no-untyped-call]
         subscriber.undeclare()  # type: ignore[no-untyped-call]
     assert (slower["stamp_ns"] - silent_ns) / 1e9 < 1.5
+    assert sum("ros2-node" in text for text in killed) == 1, killed
 
 
 def detections_body(number: int) -> dict[str, Any]:
