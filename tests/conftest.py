@@ -12,6 +12,7 @@ import pytest
 import typer
 from hypothesis import settings
 
+from companion.settings.layers import SYSTEM_VARIABLE
 from tests.programs import MAKE, NEEDS, REQUIRED
 
 # How long an example takes says more of the machine than of the code. The same examples every time, so that a
@@ -36,11 +37,17 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache_home(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests leave nothing in the user's cache and in the models folders, and find nothing there."""
+def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Tests leave nothing in the user's cache and in the models folders, and find nothing there.
+
+    They read no settings of this computer and of its user.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path_factory.mktemp("models")))
+        settings = tmp_path_factory.mktemp("settings")
+        patch.setenv("XDG_CONFIG_HOME", str(settings))
+        patch.setenv(SYSTEM_VARIABLE, str(settings / "system.toml"))
         yield
 
 

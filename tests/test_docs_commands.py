@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from companion.settings.layers import SYSTEM_VARIABLE
 from tests.page_files import put_files, put_quick_programs
 from tests.test_docs import DOCUMENTS, ROOT, shell_lines
 
@@ -148,6 +149,7 @@ def test_page_runs_as_printed_and_in_order(name: str, tmp_path: Path) -> None:
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("COMPANION_", "XDG_"))}
     places = {
         "HOME": str(tmp_path / "home"),
+        SYSTEM_VARIABLE: str(tmp_path / "system.toml"),
         "PATH": os.pathsep.join(map(str, programs)),
         "PYTHONPATH": f"{tmp_path / 'site'}:{ROOT}",
         "PYTHONUNBUFFERED": "1",

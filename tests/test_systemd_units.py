@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from companion.cli.flags import EXIT_BAD_INPUT
-from companion.settings.reading import DEFAULT_PATHS
+from companion.settings.layers import SYSTEM_FILE
 from vision.model_files import SYSTEM_FOLDER
 
 ROOT = Path(__file__).parent.parent
@@ -69,7 +69,7 @@ def test_unit_has_the_folders_of_the_program() -> None:
     found = settings(UNIT)
     folders = {Path("/var/lib") / name for name in found["StateDirectory"][0].split()}
     assert SYSTEM_FOLDER in folders
-    assert str(DEFAULT_PATHS[-1]) in found["ExecStart"][0]
+    assert str(SYSTEM_FILE) in found["ExecStart"][0]
     assert "COMPANION_MODELS_FOLDER" not in UNIT.read_text()
 
 

@@ -26,6 +26,7 @@ from rich.table import Table
 from companion.bus.client import client_settings, listen, open_client, send_command
 from companion.bus.topics import command_key
 from companion.settings import Settings
+from companion.settings.layers import SYSTEM_VARIABLE
 from companion.settings.reading import to_toml
 from companion.simulation.session import (
     ALTITUDE_M,
@@ -153,6 +154,8 @@ async def _measure(fault: Fault, seed: int) -> Reaction:
                     stdin=asyncio.subprocess.DEVNULL,
                     stderr=log,
                     start_new_session=True,
+                    # No other file of this computer: what is unset here stays so.
+                    env={**os.environ, SYSTEM_VARIABLE: name + "/none", "XDG_CONFIG_HOME": name},
                 )
             try:
                 fault_ns = await asyncio.to_thread(_fly_into, fault, settings, service.pid, truth)

@@ -45,7 +45,7 @@ app = typer.Typer(
 
 # In the order of the help: by use.
 settings_command(app)(view)
-settings_command(app)(play)
+settings_command(app, only_config=True)(play)
 settings_command(app)(run)
 app.command(cls=Command)(demo)
 settings_command(app, *DETECT_SETTINGS, optional_values=("--markers",))(detect)

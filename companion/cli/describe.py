@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import AsJson, check_belonging, plain_errors
+from companion.cli.flags import AsJson, check_belonging, plain_errors, refuse
 from companion.host.journal import marked_for_journal
 from vision.redaction import HIDDEN, redacted
 
 if TYPE_CHECKING:
     from companion.settings import Settings
+    from companion.settings.layers import LayeredSettings
     from vision.sources.csi import CsiCamera
     from vision.sources.v4l2 import FrameSize, VideoDevice
 
@@ -34,7 +35,7 @@ class What(StrEnum):
 
 
 def describe(
-    read_settings: Callable[[], Settings],
+    read_settings: Callable[[], LayeredSettings],
     context: typer.Context,
     what: Annotated[What, typer.Argument(metavar="WHAT", help="commands, topics, settings or cameras.")],
     as_json: AsJson = False,
@@ -51,24 +52,39 @@ def describe(
             help="Of the settings print only what is wrong: also key files, model, sources, folders.",
         ),
     ] = False,
+    origin: Annotated[
+        bool,
+        typer.Option(
+            "--origin",
+            help="Of the settings print what is not the default, and which file, variable or flag gave it.",
+        ),
+    ] = False,
 ) -> None:
     """Describe flight commands, topics, settings or cameras.
 
     Flight commands with arguments, units and ranges, including those of plug-ins. Topics: what they hold,
     rate and maximum age. Settings: those in effect, as a TOML file with a comment on every key. Cameras of
     this computer: formats, sizes and rates.
+
+    Settings are read from /etc/companion/companion.toml, then ~/.config/companion/companion.toml, --config,
+    the environment (COMPANION_SECTION_KEY) and flags; the later takes precedence.
     """
-    in_tables, listed = (What.COMMANDS, What.TOPICS), (What.COMMANDS, What.TOPICS, What.CAMERAS)
-    check_belonging(context, "commands, topics and cameras", ("as_json",), chosen=what in listed)
+    in_tables, of_settings = (What.COMMANDS, What.TOPICS), what is What.SETTINGS
+    no_table = not of_settings or origin
+    check_belonging(context, "commands, topics, cameras and --origin", ("as_json",), chosen=no_table)
     check_belonging(context, "commands and topics", ("as_markdown",), chosen=what in in_tables)
     check_belonging(context, "topics", ("schema",), chosen=what is What.TOPICS)
-    check_belonging(context, "settings", ("check",), chosen=what is What.SETTINGS)
+    check_belonging(context, "settings", ("check", "origin"), chosen=of_settings)
+    if check and origin:
+        refuse("--check and --origin were given: give one of them")
     if what is What.COMMANDS:
-        _describe_commands(read_settings(), as_json=as_json, as_markdown=as_markdown)
+        _describe_commands(read_settings().settings, as_json=as_json, as_markdown=as_markdown)
     elif what is What.TOPICS:
         _describe_topics(schema, as_json=as_json, as_markdown=as_markdown)
-    elif what is What.SETTINGS:
-        _describe_settings(read_settings(), check=check)
+    elif origin:
+        _describe_origins(read_settings(), as_json=as_json)
+    elif of_settings:
+        _describe_settings(read_settings().settings, check=check)
     else:
         _describe_cameras(as_json=as_json)
 
@@ -117,7 +133,30 @@ def _describe_settings(settings: Settings, *, check: bool) -> None:
             for line in (*unknown_variables(os.environ).values(), *check_settings(settings)):
                 typer.echo(marked_for_journal(f"companion: {line}", logging.WARNING), err=True)
         return
-    text = to_toml(settings)
+    _print_redacted(to_toml(settings))
+
+
+def _describe_origins(layered: LayeredSettings, *, as_json: bool) -> None:
+    from companion.cli.origins import differing, origins_toml
+
+    if not as_json:
+        _print_redacted(origins_toml(layered))
+        return
+    rows = [
+        {
+            "key": key,
+            "value": own[-1].value,
+            "default": default,
+            **own[-1].origin._asdict(),
+            "overrides": [{"value": value, **origin._asdict()} for value, origin in own[-2::-1]],
+        }
+        for key, own, default in differing(layered)
+    ]
+    found = {"files": list(map(str, layered.files.files)), "settings": rows}
+    _print_redacted(json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+
+
+def _print_redacted(text: str) -> None:
     shown = redacted(text)
     if shown != text:
         typer.echo(f"companion: secrets in addresses are printed as {HIDDEN}", err=True)

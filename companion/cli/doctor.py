@@ -19,6 +19,7 @@ from vision.redaction import redacted
 if TYPE_CHECKING:
     from companion.doctor.facts import Service
     from companion.settings import Settings
+    from companion.settings.layers import LayeredSettings, SettingsFiles
 
 _WIDTH = 80
 _COLOURS = {"fault": "red", "error": "red", "warning": "yellow"}
@@ -26,7 +27,9 @@ _REDRAW_S = 1.0
 _CLEAR = "\x1b[H\x1b[2J"
 
 
-def doctor(read_settings: Callable[[], Settings], as_json: AsJson = False) -> None:
+def doctor(
+    read_settings: Callable[[], LayeredSettings], layer_files: SettingsFiles, as_json: AsJson = False
+) -> None:
     """Find faults of link, ports, camera, model and board.
 
     Give it the settings of the service. A running service is asked, and nothing of its own is opened. Without
@@ -43,12 +46,12 @@ def doctor(read_settings: Callable[[], Settings], as_json: AsJson = False) -> No
     missing: Sequence[str] = ()
     settings = None
     try:
-        settings = read_settings()
+        settings = read_settings().settings
         missing = check_settings(settings)
     except ConfigurationError as error:
         wrong = error.problems
     named = None if settings is None else named_vehicle(settings)
-    checks = examine(settings, named, wrong=wrong, missing=missing)
+    checks = examine(settings, named, wrong=wrong, missing=missing, files=layer_files)
     if as_json:
         typer.echo(redacted(json.dumps([asdict(check) for check in checks], indent=2, ensure_ascii=False)))
     else:

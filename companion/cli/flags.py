@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     import zenoh
 
     from companion.settings import Settings
+    from companion.settings.layers import LayeredSettings
     from companion.settings.reading import Flag
 
 # The settings load pydantic, numpy and OpenCV: they are imported when a command runs or shows its own help.
@@ -59,6 +60,8 @@ SHORT_NAMES = {
     "log.level": "--log-level",
 }
 
+# Annotations of parameters that are no options; they are imported for type checkers only.
+_SETTINGS_TYPES = ("LayeredSettings", "Settings", "SettingsFiles")
 # Parts of `detect` for which the lens of the camera is read.
 _WITH_LENS = ("level", "depth", "markers", "cloud")
 # A command that takes a whole section has other options for these: only the service shares frames; --tiles.
@@ -310,22 +313,25 @@ def settings_command(
     *keys: str,
     epilog: Callable[[], str] = lambda: "",
     optional_values: tuple[str, ...] = (),
+    only_config: bool = False,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Register a function as a command of `app` that takes `--config` and settings as flags.
 
     The function's first parameter, `settings`, receives the validated settings; `read_settings` instead of it
-    a function that reads them, and may raise ConfigurationError. Optional parameters are `given`, the flags
-    that were set, key → text, and `context`. All others are the command's own.
+    a function that reads their layers, and may raise ConfigurationError. Optional parameters are
+    `layer_files`, where they are read: the command then says itself which are not; `given`, the flags that
+    were set, key → text; and `context`. All others are the command's own.
 
     Args:
         keys: the settings that are flags, by key (`vehicle.name`) or by section (`zenoh`); none: all.
         epilog: returns the text after the help, with its line breaks. optional_values: see `Command`.
+        only_config: of a command whose results must not depend on the files of system and user.
     """
 
     def register(command: Callable[..., None]) -> Callable[..., None]:
         own = {"keys": keys, "make_epilog": staticmethod(epilog), "optional_values": optional_values}
         kind = type("_WithSettings", (_WithSettings,), own)
-        return app.command(cls=kind)(_given_settings(command, keys))
+        return app.command(cls=kind)(_given_settings(command, only_config))
 
     return register
 
@@ -354,41 +360,47 @@ class _WithSettings(Command):
             formatter.write(f"\n{text}\n")
 
 
-def _given_settings(command: Callable[..., None], keys: tuple[str, ...]) -> Callable[..., None]:
+def _given_settings(command: Callable[..., None], only_config: bool) -> Callable[..., None]:
     """Return the command with the signature for typer: without `settings`, with `--config`."""
     own = inspect.signature(command)
-    hints = get_type_hints(command, include_extras=True, localns={"Settings": Any})
+    hints = get_type_hints(command, include_extras=True, localns=dict.fromkeys(_SETTINGS_TYPES, Any))
 
     @functools.wraps(command)
     def wrapper(context: typer.Context, config_file: Path | None, **values: Any) -> None:
-        from companion.settings.reading import ConfigurationError, load_settings
+        from companion.settings.layers import settings_files
+        from companion.settings.reading import ConfigurationError, load_layers
 
         given: dict[str, str | None] = context.meta[_GIVEN]
         overrides = {key: text for key, text in given.items() if text is not None}
         # The command's own SOURCE, if it is read with the camera's lens.
         with_lens = any(values.get(part) not in (None, False) for part in _WITH_LENS)
+        read_uri = values.get("source") if with_lens else None
+        files = settings_files(config_file, only_config=only_config)
 
-        def read_settings() -> Settings:
-            return load_settings(config_file, overrides, read_uri=values.get("source") if with_lens else None)
+        def read_settings() -> LayeredSettings:
+            return load_layers(files, overrides, read_uri=read_uri)
 
-        offered = {"given": overrides, "context": context}
+        offered = {"given": overrides, "layer_files": files, "context": context}
         values |= {name: value for name, value in offered.items() if name in own.parameters}
+        if "layer_files" not in own.parameters:
+            for found, advice in files.not_read:
+                text = f"companion: {found}; {advice}"
+                typer.echo(marked_for_journal(text, logging.WARNING), err=True)
         if "read_settings" in own.parameters:
             with plain_errors(ConfigurationError):
                 command(read_settings, **values)
             return
         with plain_errors(ConfigurationError):
-            settings = read_settings()
+            settings = read_settings().settings
         command(settings, **values)
 
     parameters = [
         parameter.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY)
         for name, parameter in own.parameters.items()
-        if name not in ("settings", "read_settings", "given", "context")
+        if name not in ("settings", "read_settings", "layer_files", "given", "context")
     ]
-    parameters.append(
-        _option("config_file", Path | None, "--config", help="Settings file. Default: ./companion.toml.")
-    )
+    layer = "Settings file." if only_config else "Settings file, over those of user and system."
+    parameters.append(_option("config_file", Path | None, "--config", help=layer))
     parameters.append(inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context))
     _declare(wrapper, parameters)
     return wrapper

@@ -23,6 +23,7 @@ from companion.doctor.facts import CameraTrial, CheckKind, Facts, Machine, check
 from companion.doctor.listening import Received, listen
 from companion.doctor.service_query import find_service
 from companion.settings import Settings, SourceSection
+from companion.settings.layers import NO_FILES, SettingsFiles
 from companion.settings.perception import NO_SOURCE
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 from vision.sources.opening import open_source
@@ -59,6 +60,7 @@ def examine(
     *,
     wrong: Sequence[str] = (),
     missing: Sequence[str] = (),
+    files: SettingsFiles = NO_FILES,
     machine: Machine | None = None,
 ) -> list[Check]:
     """Look at this computer and at a running service, for at most 10 s.
@@ -66,7 +68,7 @@ def examine(
     Args:
         settings: those that a service would start with; None: they cannot be read, and `wrong` says why.
         named: the vehicle's name; None: the only one alive.
-        wrong, missing: what `check_settings` says of them.
+        wrong, missing: what `check_settings` says of them. files: where they are from.
 
     Returns:
         All results, the worst first.
@@ -84,6 +86,7 @@ def examine(
         tuple(wrong),
         tuple(missing),
         settings is not None,
+        files,
     )
     if service is not None and not service.here:
         elsewhere = unknown(

@@ -19,6 +19,7 @@ from companion.doctor.check import Check, unknown
 from companion.doctor.listening import Received
 from companion.host.tasks import error_text
 from companion.settings import Settings
+from companion.settings.layers import NO_FILES, SettingsFiles
 
 _PROGRAM_S = 3.0
 
@@ -150,6 +151,7 @@ class Facts:
     Attributes:
         settings: those of the running service, else those that it would start with.
         settings_known: False: they could not be read, and `settings` are the defaults.
+        files: of the settings that a service would start with.
         service: None: none was reached.
         reached: what was found while a service was looked for.
         wrong, missing: what is wrong with the settings, and what they name and is not there.
@@ -164,6 +166,7 @@ class Facts:
     wrong: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     settings_known: bool = True
+    files: SettingsFiles = NO_FILES
     received: Received | None = None
     not_received: str = ""
     cameras: Mapping[str | None, CameraTrial] = field(default_factory=dict)

@@ -30,6 +30,15 @@ def _settings(facts: Facts) -> Iterator[Check]:
         yield ok("settings", "nothing wrong")
 
 
+def _files(facts: Facts) -> Iterator[Check]:
+    for found, advice in facts.files.not_read:
+        yield warning("settings files", found, advice)
+    if facts.service is not None:
+        return  # it was started with files of its own
+    in_force = ", then ".join(map(str, facts.files.files))
+    yield ok("settings files", f"in force: {in_force}" if in_force else "none, and defaults in force")
+
+
 def _has_own_check(line: str, facts: Facts) -> bool:
     """Whether another check says more: of a serial device, or of a camera's."""
     key = line.partition(":")[0]
@@ -99,6 +108,7 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 CHECKS = (
     CheckKind("settings", "wrong settings; devices, models, folders, key files that they name", _settings),
+    CheckKind("settings files", "files of settings that are not read, and which are in force", _files),
     CheckKind("environment", "`COMPANION_…` variables that are no setting", _variables),
     CheckKind("packages", "packages older than this version needs", _packages),
 )

@@ -1,4 +1,4 @@
-"""Reads and prints settings: a TOML file, then the environment, then flags; the later takes precedence.
+"""Reads and prints settings: TOML files, then the environment, then flags; the later takes precedence.
 
 All problems are reported at once, one line each: the key, what was expected, what was found, and where.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -30,9 +31,10 @@ from companion.settings.fields import (
     value_from_text,
 )
 from companion.settings.former import LENS, REMOVED, RENAMED, VERSION, lens_line
+from companion.settings.layers import FLAG, SYSTEM_VARIABLE, Given, LayeredSettings, Origin, SettingsFiles
 from companion.settings.section import Section
 from companion.settings.settings import Settings
-from companion.settings.toml_text import parse_toml
+from companion.settings.toml_text import key_lines, parse_toml
 from vision.file_kinds import explained
 from vision.redaction import redacted
 from vision.text_file import read_text
@@ -41,18 +43,18 @@ __all__ = [
     "ConfigurationError",
     "Flag",
     "Settings",
-    "default_path",
     "flags",
+    "load_layers",
     "load_settings",
     "to_toml",
     "unknown_variables",
 ]
 
-DEFAULT_PATHS = (Path("companion.toml"), Path("/etc/companion/companion.toml"))
 # COMPANION_DETECTOR_IMAGE_SIZE is detector.image_size. No section's name begins with another's and `_`.
 ENVIRONMENT_PREFIX = "COMPANION_"
-# Other variables of this project: of its tests, and of the models folder.
-_NO_SETTINGS = ("COMPANION_TEST_", "COMPANION_SITL_", "COMPANION_MODELS_FOLDER")
+# Other variables of this project: of its tests, and places of files.
+_NO_SETTINGS = ("COMPANION_TEST_", "COMPANION_SITL_", "COMPANION_MODELS_FOLDER", SYSTEM_VARIABLE)
+_WORDS = re.compile(r"[\w.-]*\w")
 
 
 class ConfigurationError(ValueError):
@@ -89,37 +91,50 @@ def flags() -> list[Flag]:
     ]
 
 
-def default_path() -> Path | None:
-    """Return the file that is read by default: the first of `DEFAULT_PATHS` that exists."""
-    return next((path for path in DEFAULT_PATHS if path.exists()), None)
-
-
 def load_settings(
     path: str | Path | None = None,
     overrides: Mapping[str, str] | None = None,
     environment: Mapping[str, str] | None = None,
     read_uri: str | None = None,
 ) -> Settings:
-    """Load the settings in effect.
+    """Load settings of one file, or of none. No other file of this computer is read.
 
     Args:
-        path: the TOML file; None: `default_path()`, or only the defaults if there is none.
+        path: the TOML file; None: only the defaults.
+        overrides, environment, read_uri: as `load_layers`.
+
+    Raises:
+        ConfigurationError: with every problem found.
+    """
+    files = SettingsFiles(() if path is None else (Path(path),))
+    return load_layers(files, overrides, environment, read_uri).settings
+
+
+def load_layers(
+    files: SettingsFiles,
+    overrides: Mapping[str, str] | None = None,
+    environment: Mapping[str, str] | None = None,
+    read_uri: str | None = None,
+) -> LayeredSettings:
+    """Load the settings in effect: each file over those before it, then the environment, then flags.
+
+    Args:
+        files: of `settings_files`.
         overrides: dotted key → text, from flags. An empty text or `none` unsets an optional value; commas
             separate the items of a list.
         environment: `COMPANION_SECTION_KEY` → text; None: the process's own.
         read_uri: the source that is read with `camera`'s lens, if it is not `source.uri`.
 
     Raises:
-        ConfigurationError: with every problem found.
+        ConfigurationError: with every problem found, each with the file, variable or flag that has it.
     """
-    chosen = Path(path) if path is not None else default_path()
     reading = _Reading()
-    if chosen is not None:
-        reading.take_file(chosen)
+    for path in files.files:
+        reading.take_file(path)
     reading.take_environment(os.environ if environment is None else environment)
     for key, text in (overrides or {}).items():
-        reading.take_text(key, text, "given as a flag")
-    return reading.settings(read_uri)
+        reading.take_text(key, text, FLAG)
+    return LayeredSettings(reading.settings(read_uri), reading.given(), files)
 
 
 def unknown_variables(environment: Mapping[str, str]) -> dict[str, str]:
@@ -149,7 +164,7 @@ def changed(settings: Settings, changes: Mapping[str, str]) -> Settings:
     reading = _Reading()
     reading.take_values(settings)
     for key, text in changes.items():
-        reading.take_text(key, text, "given as a flag")
+        reading.take_text(key, text, FLAG)
     return reading.settings()
 
 
@@ -161,7 +176,7 @@ def with_values(settings: Settings, values: Mapping[str, Any], origin: str) -> S
     reading = _Reading()
     reading.take_values(settings)
     for key, value in values.items():
-        reading.take_value(key, value, origin)
+        reading.take_value(key, value, Origin("other", origin))
     return reading.settings()
 
 
@@ -197,19 +212,31 @@ class _Reading:
         self._fields = fields_of_sections()
         self._keys = [f"{section}.{name}" for section, names in self._fields.items() for name in names]
         self._values: dict[str, dict[str, Any]] = {}
-        self._origins: dict[str, str] = {}
+        # Dotted key → what the layers gave, the last in effect.
+        self._given: dict[str, list[Given]] = {}
         self._problems: list[str] = []
         # Table → former key of a lens → value and origin.
-        self._lenses: dict[str, dict[str, tuple[Any, str]]] = {}
+        self._lenses: dict[str, dict[str, Given]] = {}
+        # Dotted key → line in the file that is being read.
+        self._lines: dict[str, int] = {}
 
     def take_file(self, path: Path) -> None:
-        origin = f"in {path}"
-        for name, content in _read_toml(path).items():
-            if name == "cameras" and isinstance(content, dict):
-                for name, sections in content.items():
-                    self._take_camera(name, sections, origin)
+        origin = Origin("file", str(path))
+        try:
+            content, self._lines = _read_toml(path)
+        except ConfigurationError as error:
+            self._problems += error.problems
+            return
+        for name, table in content.items():
+            if name == "cameras" and isinstance(table, dict):
+                for camera, sections in table.items():
+                    self._take_camera(camera, sections, origin)
             else:
-                self._take_table(name, content, origin)
+                self._take_table(name, table, origin)
+        self._lines = {}
+
+    def given(self) -> dict[str, tuple[Given, ...]]:
+        return {key: tuple(values) for key, values in self._given.items()}
 
     def take_values(self, settings: Settings) -> None:
         sections = {name: getattr(settings, name) for name in self._fields}
@@ -219,7 +246,8 @@ class _Reading:
         for table, section in sections.items():
             # What is not a key too: `camera.lens`.
             self._values[table] = {name: getattr(section, name) for name in section.model_fields_set}
-            self._origins |= {f"{table}.{name}": "in effect" for name in self._values[table]}
+            for name, value in self._values[table].items():
+                self._given[f"{table}.{name}"] = [Given(value, Origin("other", "in effect"))]
 
     def take_environment(self, environment: Mapping[str, str]) -> None:
         for variable in sorted(environment):
@@ -230,13 +258,13 @@ class _Reading:
             for section in self._fields:
                 if words.startswith(f"{section}_"):
                     name = words.removeprefix(f"{section}_")
-                    self.take_text(f"{section}.{name}", environment[variable], f"given as {variable}")
+                    self.take_text(f"{section}.{name}", environment[variable], Origin("variable", variable))
 
-    def take_value(self, key: str, value: Any, origin: str) -> None:
+    def take_value(self, key: str, value: Any, origin: Origin) -> None:
         table, _, name = key.rpartition(".")
         self._take(table, name, value, origin)
 
-    def take_text(self, key: str, text: str, origin: str) -> None:
+    def take_text(self, key: str, text: str, origin: Origin) -> None:
         table, _, name = key.rpartition(".")
         field = self._field(table, name)
         if field is None:
@@ -252,7 +280,7 @@ class _Reading:
     def settings(self, read_uri: str | None = None) -> Settings:
         for table, lens in self._lenses.items():
             keys = ", ".join(f"{table}.{name}" for name in lens)
-            origins = ", ".join(dict.fromkeys(origin for _, origin in lens.values()))
+            origins = ", ".join(dict.fromkeys(str(origin) for _, origin in lens.values()))
             line = lens_line({name: value for name, (value, _) in lens.items()})
             removed = f"{'was' if len(lens) == 1 else 'were'} removed in version {VERSION}"
             self._problems.append(
@@ -279,7 +307,7 @@ class _Reading:
         section = section_of(table)
         return None if section is None else self._fields[section].get(name)
 
-    def _take_camera(self, name: str, sections: Any, origin: str) -> None:
+    def _take_camera(self, name: str, sections: Any, origin: Origin) -> None:
         if not isinstance(sections, dict):
             self._problems.append(
                 f"cameras.{name}: must hold sections such as [cameras.{name}.source], got {shown(sections)} "
@@ -291,7 +319,7 @@ class _Reading:
         for section, content in sections.items():
             self._take_table(f"cameras.{name}.{section}", content, origin)
 
-    def _take_table(self, table: str, content: Any, origin: str) -> None:
+    def _take_table(self, table: str, content: Any, origin: Origin) -> None:
         if table == "views":
             self._problems.append(f"[views] ({origin}) was renamed to [cameras] in version 0.2.0")
         elif section_of(table) is None:
@@ -305,21 +333,26 @@ class _Reading:
             for name, value in content.items():
                 self._take(table, name, value, origin)
 
-    def _take(self, table: str, name: str, value: Any, origin: str) -> None:
+    def _take(self, table: str, name: str, value: Any, origin: Origin) -> None:
         key = f"{table}.{name}"
         if self._field(table, name) is None:
             self._take_unknown(table, name, value, origin)
             return
         # TOML has arrays; the settings are frozen and hold tuples.
-        self._values.setdefault(table, {})[name] = tuple(value) if isinstance(value, list) else value
-        self._origins[key] = origin
+        value = tuple(value) if isinstance(value, list) else value
+        self._values.setdefault(table, {})[name] = value
+        self._given.setdefault(key, []).append(Given(value, self._with_line(key, origin)))
 
-    def _take_unknown(self, table: str, name: str, value: Any, origin: str) -> None:
+    def _with_line(self, key: str, origin: Origin) -> Origin:
+        return origin._replace(line=self._lines.get(key)) if origin.kind == "file" else origin
+
+    def _take_unknown(self, table: str, name: str, value: Any, origin: Origin) -> None:
         section = section_of(table) or table
         if section == "camera" and name in LENS:
-            self._lenses.setdefault(table, {})[name] = value, origin
+            self._lenses.setdefault(table, {})[name] = Given(value, origin)
             return
         key = f"{table}.{name}" if table else name
+        origin = self._with_line(key, origin)
         own = f"{section}.{name}" if section else name
         if now := RENAMED.get(own):
             now = f"{table}.{now.partition('.')[2]}"
@@ -336,22 +369,35 @@ class _Reading:
         depth = 3 if parts[:1] == ["cameras"] else 1
         table, rest = ".".join(parts[:depth]), parts[depth:]
         if not rest:  # a rule about several keys of the section, or of several sections
-            origins = {origin for key, origin in self._origins.items() if key.startswith(f"{table}.")}
-            suffix = f" ({', '.join(sorted(origins))})" if table else ""
-            return f"{table}{': ' if table else ''}{details['ctx']['error']}{suffix}"
+            text = str(details["ctx"]["error"])
+            return f"{table}: {text}{self._origins(text, table)}" if table else f"{text}{self._origins(text)}"
         key = f"{table}.{rest[0]}"
         if details["type"] == "value_error":  # a rule of the value's own
-            return f"{key}: {details['ctx']['error']} ({self._origins[key]})"
+            return f"{key}: {details['ctx']['error']} ({self._origin(key)})"
         value = shown(self._values[table][rest[0]])
         section = section_of(table)
         assert section is not None
         expected = expectation(self._fields[section][rest[0]])
-        return f"{key}: must be {expected}, got {value} ({self._origins[key]})"
+        return f"{key}: must be {expected}, got {value} ({self._origin(key)})"
+
+    def _origin(self, key: str) -> Origin:
+        return self._given[key][-1].origin
+
+    def _origins(self, text: str, table: str = "") -> str:
+        """Return in brackets where the keys were given that a message names; else all those of the table."""
+        words = _WORDS.findall(text)
+        keys = [*words, *(f"{table}.{word}" for word in words)]
+        keys = [key for key in keys if key in self._given]
+        keys = keys or [key for key in self._given if table and key.startswith(f"{table}.")]
+        origins = sorted({str(self._origin(key)) for key in keys})
+        return f" ({', '.join(origins)})" if origins else ""
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def _read_toml(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
+    """Return the tables of a file, and the lines of its keys."""
     try:
-        return parse_toml(read_text(path))
+        text = read_text(path)
+        return parse_toml(text), key_lines(text)
     except OSError as error:
         raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:

@@ -19,6 +19,8 @@ _STRING_OR_COMMENT = re.compile(
     re.DOTALL,
 )
 _PART = re.compile(r"[\w-]+")
+_TABLE = re.compile(r"\[\s*([\w.-]+)\s*\]\s*")
+_KEY = re.compile(r"([\w.-]+)\s*=")
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -40,3 +42,21 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise
     except ValueError as error:  # an integer of too many digits, a date out of range
         raise tomllib.TOMLDecodeError(f"{str(error).partition(';')[0]} (at end of document)") from error
+
+
+def key_lines(text: str) -> dict[str, int]:
+    """Return dotted key → line of a valid TOML text; without quoted keys and those of inline tables."""
+    lines = {}
+    table: str | None = ""
+    depth = 0  # of an array over several lines
+    plain = _STRING_OR_COMMENT.sub(lambda found: "_" + "\n" * found[0].count("\n"), text)
+    for number, line in enumerate(plain.split("\n"), 1):
+        line = line.strip().removesuffix("_") if line.lstrip().startswith("[") else line.strip()
+        if depth == 0 and line.startswith("["):
+            found = _TABLE.fullmatch(line)
+            table = None if found is None else f"{found[1]}."
+            continue
+        if depth == 0 and table is not None and (key := _KEY.match(line)):
+            lines[f"{table}{key[1]}"] = number
+        depth += line.count("[") - line.count("]")
+    return lines

@@ -12,6 +12,7 @@ from pathlib import Path
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
+from companion.settings.layers import SYSTEM_VARIABLE
 
 COLUMNS = {"COLUMNS": "200", "NO_COLOR": "1"}
 # `companion`, whose simulated vehicles take off and land quickly: for `python -c`.
@@ -27,7 +28,7 @@ cli.main()
 def companion(*arguments: str | Path, cwd: Path, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Run `companion` in a given folder and without COMPANION_ variables."""
     command = [sys.executable, "-m", "companion.cli", *(str(argument) for argument in arguments)]
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("COMPANION_")}
+    environment = {key: value for key, value in os.environ.items() if key not in _unset()}
     return subprocess.run(
         command,
         cwd=cwd,
@@ -47,7 +48,6 @@ def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedPro
     signal handlers and replace standard error of the process.
     """
     command = [str(argument) for argument in arguments]
-    unset = {key: None for key in os.environ if key.startswith("COMPANION_")}
     # pytest's handlers would make the command's `logging.basicConfig` do nothing.
     root = logging.getLogger()
     handlers, level = root.handlers, root.level
@@ -55,10 +55,15 @@ def companion_here(*arguments: str | Path, cwd: Path) -> subprocess.CompletedPro
     root.setLevel(logging.WARNING)
     try:
         with chdir(cwd):
-            done = CliRunner().invoke(app, command, env={**unset, **COLUMNS})
+            done = CliRunner().invoke(app, command, env={**dict.fromkeys(_unset()), **COLUMNS})
     finally:
         root.handlers = handlers
         root.setLevel(level)
     if done.exception is not None and not isinstance(done.exception, SystemExit):
         raise done.exception
     return subprocess.CompletedProcess(command, done.exit_code, done.stdout, done.stderr)
+
+
+def _unset() -> list[str]:
+    """All variables of settings; the settings of this computer stay left out."""
+    return [key for key in os.environ if key.startswith("COMPANION_") and key != SYSTEM_VARIABLE]

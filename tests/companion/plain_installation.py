@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+from companion.settings.layers import SYSTEM_VARIABLE
 from vision.extras import EXTRA_OF
 
 
@@ -20,7 +21,8 @@ def environment_without(folder: Path, modules: Iterable[str] = EXTRA_OF) -> dict
     hide = f"import sys\nsys.modules.update(dict.fromkeys({sorted(modules)!r}))\n"
     (folder / "sitecustomize.py").write_text(hide)
     path = os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
-    return {key: text for key, text in os.environ.items() if not key.startswith("COMPANION_")} | {
+    own = {key for key in os.environ if key.startswith("COMPANION_")} - {SYSTEM_VARIABLE}
+    return {key: text for key, text in os.environ.items() if key not in own} | {
         "PYTHONPATH": path,
         "COLUMNS": "200",
         "NO_COLOR": "1",

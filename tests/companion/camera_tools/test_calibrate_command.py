@@ -349,6 +349,7 @@ def test_calibration_of_another_camera_is_refused(folder: Path, tmp_path: Path) 
         assert CliRunner().invoke(app, ["describe", "settings", *fits, *flags]).exit_code == 0
 
 
+CONFIG = ("--config", "companion.toml")
 # By name: command and options.
 _READERS = {
     "status": ("detect", "--model", "none"),
@@ -385,7 +386,7 @@ def test_source_of_the_service_is_read_by_a_command(
     reader: str, source: str, settings: str, opened: list[str]
 ) -> None:
     Path("companion.toml").write_text(settings)
-    done = CliRunner().invoke(app, [*_READERS[reader], source])
+    done = CliRunner().invoke(app, [*_READERS[reader], source, *CONFIG])
     assert opened == [source], done.output
 
 
@@ -397,9 +398,9 @@ def test_lens_must_fit_the_source_that_is_read(opened: list[str]) -> None:
         Path("companion.toml").write_text(
             f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"'
         )
-        assert own in one_line_of_bad_input(CliRunner().invoke(app, [*_READERS[reader], other]))
+        assert own in one_line_of_bad_input(CliRunner().invoke(app, [*_READERS[reader], other, *CONFIG]))
         Path("companion.toml").write_text(f'[source]\nuri = "{other}"')
-        CliRunner().invoke(app, [*_READERS[reader], own, *lens])
+        CliRunner().invoke(app, [*_READERS[reader], own, *CONFIG, *lens])
     assert opened == [own] * 3
 
 
@@ -408,9 +409,10 @@ def test_command_that_uses_no_lens_reads_another_camera(opened: list[str]) -> No
     write_camera_info(Path("camera.yaml"), LENS, own)
     Path("companion.toml").write_text(f'[source]\nuri = "{own}"\n[camera]\ncalibration_file = "camera.yaml"')
     for reader in ("status", "mount"):
-        CliRunner().invoke(app, [*_READERS[reader], other])
+        CliRunner().invoke(app, [*_READERS[reader], other, *CONFIG])
     assert opened == [other] * 2
-    levelled = CliRunner().invoke(app, [*_READERS["status"], other, "--level", "--save", "images"])
+    words = [*_READERS["status"], other, *CONFIG, "--level", "--save", "images"]
+    levelled = CliRunner().invoke(app, words)
     assert own in one_line_of_bad_input(levelled)
 
 

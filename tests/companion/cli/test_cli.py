@@ -32,6 +32,8 @@ from vision.weights import DEFAULT_WEIGHTS
 
 pytestmark = pytest.mark.realtime
 
+CONFIG = ("--config", "companion.toml")
+
 
 def one_line_of_bad_input(done: subprocess.CompletedProcess[str]) -> str:
     """Return the only line on standard error; check that the exit code is 2."""
@@ -187,7 +189,7 @@ def test_unreadable_video_is_one_line(exported_model: Path, tmp_path: Path) -> N
 
 def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text("[detector]\nconfidence = 1.5\n")
-    line = one_line_of_bad_input(companion_here("run", cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("run", *CONFIG, cwd=tmp_path))
     assert "detector.confidence" in line
     assert "0 to 1" in line
 
@@ -210,8 +212,8 @@ def test_view_is_run_without_a_vehicle(tmp_path: Path, monkeypatch: pytest.Monke
     shown: list[Settings] = []
     monkeypatch.setattr("companion.cli.view.run_service", lambda settings, _: shown.append(settings))
     (tmp_path / "companion.toml").write_text("[vehicle]\nurl = 'udpin://0.0.0.0:14540'\n")
-    assert companion_here("view", "street.mp4", "--model", "yolo11n", cwd=tmp_path).returncode == 0
-    assert companion_here("view", "-", "--source-loop", "false", cwd=tmp_path).returncode == 0
+    assert companion_here("view", "street.mp4", *CONFIG, "--model", "yolo11n", cwd=tmp_path).returncode == 0
+    assert companion_here("view", "-", *CONFIG, "--source-loop", "false", cwd=tmp_path).returncode == 0
     assert [each.vehicle.expected for each in shown] == [False, False]
     assert [(each.source.uri, each.source.loop) for each in shown] == [("street.mp4", True), ("-", False)]
     assert shown[0].detector.model == "yolo11n"
@@ -254,7 +256,7 @@ def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
 def test_config_merges_file_environment_and_flags(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text('[vehicle]\nname = "alpha"\n')
     done = companion_here(
-        "describe", "settings", "--detector-image-size", "320", "--source", "-", cwd=tmp_path
+        "describe", "settings", *CONFIG, "--detector-image-size", "320", "--source", "-", cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
     assert 'name = "alpha"' in done.stdout
@@ -443,7 +445,9 @@ def test_old_flag_names_the_new_one_in_every_command(
 
 def test_old_flag_is_reported_with_all_other_faults(tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text("[tracker]\nlost_s = 1.0\n[detector]\nimage_size = 1\n")
-    done = companion_here("run", "--tracker-true-score", "0.3", "--detector-every", "2", cwd=tmp_path)
+    done = companion_here(
+        "run", *CONFIG, "--tracker-true-score", "0.3", "--detector-every", "2", cwd=tmp_path
+    )
     assert done.returncode == 2
     lines = done.stderr.splitlines()
     for key in ("tracker.confirm_score", "tracker.coast_timeout_s", "detector.image_size", "detector.every"):

@@ -140,7 +140,7 @@ def test_what_may_come_later_is_no_fault(key: str, arguments: list[str], tmp_pat
 
 def test_further_cameras_are_checked(tmp_path: Path) -> None:
     written(tmp_path / "companion.toml", b'[cameras.down.source]\nuri = "absent.mp4"\n')
-    code, lines = check(tmp_path)
+    code, lines = check(tmp_path, "--config", "companion.toml")
     assert code == 2
     assert [line.partition(":")[0] for line in lines] == ["cameras.down.source.uri"]
 

@@ -79,7 +79,7 @@ def test_of_several_vehicles_one_must_be_named(words: tuple[str, ...], tmp_path:
 @pytest.mark.parametrize("layer", ["flag", "file"])
 def test_given_name_is_never_replaced(layer: str, tmp_path: Path) -> None:
     (tmp_path / "companion.toml").write_text('[vehicle]\nname = "vehicle1"\n' if layer == "file" else "")
-    flag = ("--vehicle-name", "vehicle1") if layer == "flag" else ()
+    flag = ("--vehicle-name", "vehicle1") if layer == "flag" else ("--config", "companion.toml")
     with services("hawk") as (endpoint, received):
         done = companion_here("send", "hold", "--connect", endpoint, *flag, cwd=tmp_path)
     assert done.returncode == 2

@@ -45,7 +45,7 @@ def test_two_models_on_one_camera_and_the_second_steers(
 
     with (
         heartbeats() as port,
-        running_service(port, seeing, cwd=tmp_path) as service,
+        running_service(port, ["--config", "companion.toml", *seeing], cwd=tmp_path) as service,
         service.client() as session,
     ):
         listen(session, "companion/*/**/detections", lambda key, text: received.put((key, json.loads(text))))

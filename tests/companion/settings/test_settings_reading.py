@@ -15,7 +15,6 @@ from companion.settings.reading import (
     ConfigurationError,
     Settings,
     changed,
-    default_path,
     flags,
     load_settings,
     to_toml,
@@ -26,11 +25,6 @@ from vision.camera_model import CameraModel
 from vision.detector import DEFAULT_MODEL
 
 REPOSITORY = Path(__file__).resolve().parents[3]
-
-
-@pytest.fixture(autouse=True)
-def _no_file_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.settings.reading.DEFAULT_PATHS", (Path("companion.toml"),))
 
 
 def written(path: Path, text: str) -> Path:
@@ -47,8 +41,7 @@ def problems(
     return list(caught.value.problems)
 
 
-def test_without_a_file_the_defaults_are_in_effect(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_without_a_file_the_defaults_are_in_effect() -> None:
     assert load_settings(environment={}) == Settings()
 
 
@@ -75,15 +68,6 @@ def test_variable_of_a_section_with_an_underscore_is_read() -> None:
 def test_ground_station_that_cannot_be_is_refused(values: dict[str, str], words: list[str]) -> None:
     (line,) = problems(overrides=values)
     assert all(word in line for word in words), line
-
-
-def test_file_in_the_working_directory_is_the_default(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    written(tmp_path / "companion.toml", "[vehicle]\nname = 'kestrel'\n")
-    assert default_path() == Path("companion.toml")
-    assert load_settings(environment={}).vehicle.name == "kestrel"
 
 
 def test_precedence_is_flags_environment_file(tmp_path: Path) -> None:
@@ -220,7 +204,8 @@ def test_error_in_a_file_names_key_and_file(tmp_path: Path, toml: str, key: str,
     (line,) = problems(path)
     assert line.startswith(key)
     assert words in line
-    assert f"(in {path})" in line
+    place = ", line 2" if key.strip() not in ("detector:", "unknown section") else ""
+    assert f"(in {path}{place})" in line
 
 
 @pytest.mark.parametrize(
