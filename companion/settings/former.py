@@ -104,6 +104,37 @@ REMOVED = {
 """Former key → what to do instead."""
 
 
+class Changed(NamedTuple):
+    """A key that means more than it did.
+
+    Attributes:
+        as_before: whether a value means what it did.
+        now: what it means now, in words.
+    """
+
+    as_before: Callable[[Any], bool]
+    now: str
+
+
+def _is(*values: Any) -> Callable[[Any], bool]:
+    return lambda value: value in values
+
+
+CHANGED = {
+    "guidance.perception_max_age_s": Changed(
+        _is(0.5), "it limits the age of depth too, which was 0.5 s: the vehicle brakes later or earlier"
+    ),
+    "source.every_frame": Changed(
+        _is(False), "true holds for files too, which are then read as fast as their frames are processed"
+    ),
+    "vehicle.connect_timeout_s": Changed(_is(30.0), "the service waits for the autopilot without a limit"),
+    "vehicle.driver": Changed(
+        _is("mavsdk", "pymavlink"), 'auto is pymavlink for PX4 too; "mavsdk" is what it was'
+    ),
+}
+"""Key → what it means since this version; said of a file that has former keys, and is of 0.1 therefore."""
+
+
 def lens_line(values: Mapping[str, Any]) -> str:
     """Return a calibration file of one line for former keys of a lens, with words for what is not given."""
     given = {name: str(value) for name, value in values.items() if name in LENS}

@@ -30,7 +30,7 @@ from companion.settings.fields import (
     toml_value,
     value_from_text,
 )
-from companion.settings.former import LENS, REMOVED, RENAMED, VERSION, lens_line
+from companion.settings.former import CHANGED, LENS, REMOVED, RENAMED, VERSION, lens_line
 from companion.settings.layers import FLAG, SYSTEM_VARIABLE, Given, LayeredSettings, Origin, SettingsFiles
 from companion.settings.section import Section
 from companion.settings.settings import Settings
@@ -217,8 +217,9 @@ class _Reading:
         self._problems: list[str] = []
         # Table → former key of a lens → value and origin.
         self._lenses: dict[str, dict[str, Given]] = {}
-        # Dotted key → line in the file that is being read.
+        # Of the file that is being read: dotted key → line, and whether it has a former key.
         self._lines: dict[str, int] = {}
+        self._is_former = False
 
     def take_file(self, path: Path) -> None:
         origin = Origin("file", str(path))
@@ -227,16 +228,38 @@ class _Reading:
         except ConfigurationError as error:
             self._problems += error.problems
             return
+        self._is_former = "views" in content
+        if self._is_former:
+            self._problems.append(f"[views] ({origin}) was renamed to [cameras] in version {VERSION}")
+            # Read as such, so that former keys in it are named at once too.
+            self._lines |= {
+                "cameras" + key.removeprefix("views"): line
+                for key, line in self._lines.items()
+                if key.startswith("views.")
+            }
         for name, table in content.items():
-            if name == "cameras" and isinstance(table, dict):
+            if name in ("cameras", "views") and isinstance(table, dict):
                 for camera, sections in table.items():
                     self._take_camera(camera, sections, origin)
-            else:
+            elif name != "views":
                 self._take_table(name, table, origin)
+        if self._is_former:
+            self._say_changed(origin)
         self._lines = {}
 
     def given(self) -> dict[str, tuple[Given, ...]]:
         return {key: tuple(values) for key, values in self._given.items()}
+
+    def _say_changed(self, file: Origin) -> None:
+        for key, given in self._given.items():
+            value, origin = given[-1]
+            table, _, name = key.rpartition(".")
+            changed = CHANGED.get(f"{section_of(table)}.{name}")
+            if changed is not None and origin[:2] == file[:2] and not changed.as_before(value):
+                self._problems.append(
+                    f"{key} = {shown(value)} ({origin}): since version {VERSION} {changed.now}; check it: "
+                    "it is accepted once the former keys of the file are gone"
+                )
 
     def take_values(self, settings: Settings) -> None:
         sections = {name: getattr(settings, name) for name in self._fields}
@@ -320,9 +343,7 @@ class _Reading:
             self._take_table(f"cameras.{name}.{section}", content, origin)
 
     def _take_table(self, table: str, content: Any, origin: Origin) -> None:
-        if table == "views":
-            self._problems.append(f"[views] ({origin}) was renamed to [cameras] in version 0.2.0")
-        elif section_of(table) is None:
+        if section_of(table) is None:
             known = SECTIONS_OF_CAMERA if table.startswith("cameras.") else self._fields
             self._problems.append(
                 f"unknown section [{table}] ({origin}); {_nearest(table.rpartition('.')[2], known)}"
@@ -348,12 +369,13 @@ class _Reading:
 
     def _take_unknown(self, table: str, name: str, value: Any, origin: Origin) -> None:
         section = section_of(table) or table
+        own = f"{section}.{name}" if section else name
+        self._is_former = self._is_former or own in RENAMED or own in REMOVED
         if section == "camera" and name in LENS:
             self._lenses.setdefault(table, {})[name] = Given(value, origin)
             return
         key = f"{table}.{name}" if table else name
         origin = self._with_line(key, origin)
-        own = f"{section}.{name}" if section else name
         if now := RENAMED.get(own):
             now = f"{table}.{now.partition('.')[2]}"
             self._problems.append(f"{key} ({origin}) was renamed to {now} in version {VERSION}")
