@@ -361,6 +361,7 @@ def arguments_of(kind: type[Command]) -> tuple[tuple[Part, Argument], ...]:
     return (*found, *last)
 
 
+@cache
 def either_of(kind: type[Command]) -> tuple[str, ...]:
     """Keys of which exactly one must be given; the first may be written without its key."""
     hints = get_type_hints(kind, include_extras=True)
