@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import time
 from collections.abc import Mapping
@@ -80,7 +81,7 @@ def play(
         from companion.simulation.session import SimSessionError
         from companion.vehicle.driver import LinkError
 
-    use_for_standard_error()
+    standard_error = use_for_standard_error()
     level = settings.log.level.upper() if "log.level" in given else "WARNING"
     log_to_standard_error(level, "companion: %(message)s")
     # The service's events are printed here with their time; do not log them as well.
@@ -89,7 +90,9 @@ def play(
     service.addHandler(logging.NullHandler())
     options = PlayOptions(scene, seed, vehicles, url, autopilot, with_camera)
     errors = (SimSessionError, LinkError, PerceptionStartError, BusError, MetricsError, PluginError)
-    output = LineOutput(sys.stdout.fileno())
+    # On one terminal all lines are written by one: above the line that is being typed.
+    one = standard_error if os.path.sameopenfile(1, 2) else None
+    output = one or LineOutput(sys.stdout.fileno())
     with plain_errors(*errors):
         try:
             start(
@@ -99,4 +102,5 @@ def play(
             typer.echo(f"companion: {error}", err=True)
             raise typer.Exit(EXIT_FAILED) from error
         finally:
-            output.end()
+            if output is not standard_error:
+                output.end()

@@ -1,8 +1,8 @@
 """A standard error that never blocks the program.
 
 A pipe holds 64 KiB, then a write waits for its reader; a terminal stopped with Ctrl-S holds less. So lines
-are queued, and one thread writes them. In systemd's journal a line without a priority, such as one of a
-traceback, is an error.
+are queued, and one thread writes them, above the line that is being typed. In systemd's journal a line
+without a priority, such as one of a traceback, is an error.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ LONGEST_LINE = 16 * 1024
 """Characters; a longer text without a line end is written as a line."""
 # Size of one write: with a slow reader, the queue empties in small steps.
 _WRITE_BYTES = 4096
+# ECMA-48: to the first column, and erase to the end of the line.
+_ERASE = b"\r\x1b[K"
 
 
 class LineOutput(io.TextIOBase):
@@ -47,6 +49,7 @@ class LineOutput(io.TextIOBase):
         self._lines: deque[bytes] = deque()
         self.queued_bytes = self._unreported = 0
         self._partial = ""
+        self._prompt = self._drawn = b""
         self._to_journal = is_journal(descriptor)
         self._writing = self._ended = False
         self._thread = threading.Thread(target=self._run, name="line output", daemon=True)
@@ -79,6 +82,21 @@ class LineOutput(io.TextIOBase):
         """Queue one line."""
         self.write(f"{line}\n")
 
+    def show(self, prompt: str) -> None:
+        """Keep a text of one row below the lines, from now on; empty: none. Never waits.
+
+        Only the newest is drawn, however slow the terminal is. Control sequences may move the cursor in it.
+        """
+        with self._changed:
+            self._prompt = prompt.encode("utf-8", "backslashreplace")
+            self._changed.notify_all()
+
+    def redraw(self) -> None:
+        """Draw the text below the lines again: something else has written to the terminal."""
+        with self._changed:
+            self._drawn = b""
+            self._changed.notify_all()
+
     def _put(self, line: str) -> None:
         text = marked(line, logging.ERROR) if self._to_journal else line
         data = f"{text}\n".encode("utf-8", "backslashreplace")
@@ -102,11 +120,15 @@ class LineOutput(io.TextIOBase):
             if self._partial:
                 self._put(self._partial)
                 self._partial = ""
-            self._ended = True
+            self._ended, self._prompt = True, b""
             self._changed.notify_all()
-            while (self._lines or self._writing) and (left_s := deadline_s - time.monotonic()) > 0:
+            while self._unwritten and (left_s := deadline_s - time.monotonic()) > 0:
                 self._changed.wait(left_s)
-            return not (self._lines or self._writing)
+            return not self._unwritten
+
+    @property
+    def _unwritten(self) -> bool:
+        return bool(self._lines or self._drawn or self._writing)
 
     def _run(self) -> None:
         written = True
@@ -117,23 +139,33 @@ class LineOutput(io.TextIOBase):
                     self._drop(1)
 
     def _next(self, *, report: bool) -> bytes | None:
-        """Wait for a line; None at the end. `report`: when the queue is empty, report dropped lines."""
+        """Wait for a line or a prompt; None at the end. `report`: report dropped lines after the last one."""
         with self._changed:
             self._writing = False
             self._changed.notify_all()
             while not self._lines:
+                if self._prompt != self._drawn and not (self._unreported and report):
+                    self._drawn, self._writing = self._prompt, True
+                    return _ERASE + self._prompt
                 if self._unreported and report:
                     count, self._unreported = self._unreported, 0
                     self._writing = True
                     text = f"companion: {count} lines dropped: the output was not read"
-                    return f"{marked(text, logging.WARNING) if self._to_journal else text}\n".encode()
+                    return self._above(
+                        f"{marked(text, logging.WARNING) if self._to_journal else text}\n".encode()
+                    )
                 if self._ended:
                     return None
                 self._changed.wait()
             data = self._lines.popleft()
             self.queued_bytes -= len(data)
             self._writing = True
-            return data
+            return self._above(data)
+
+    def _above(self, line: bytes) -> bytes:
+        """Return what writes a line where the prompt is; the prompt is drawn again after the last line."""
+        drawn, self._drawn = self._drawn, b""
+        return _ERASE + line if drawn else line
 
     def _written(self, data: bytes) -> bool:
         while data:

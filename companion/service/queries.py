@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import re
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
 from companion.bus.bodies.service import ModelBody, ModelsBody, StatusBody
 from companion.bus.session import QueryHandler
 from companion.bus.topics import IMAGE
 from companion.guidance.grammar import json_schema
+from companion.operator.console import Target
 from companion.perception.cameras import WorkerCamera
 from companion.perception.supervisor import PerceptionState
 from companion.service.live_settings import LiveSettings
@@ -47,6 +48,10 @@ class Queries:
             "commands": self._commands,
             **images,
         }
+
+    def target(self, command: Callable[[str], Awaitable[dict[str, Any]]]) -> Target:
+        """Return what a console in this process needs, after `handlers` was called."""
+        return Target(command, self._live.answer, self._status_now, self._commands)
 
     def image_wanted(self, camera: WorkerCamera) -> bool:
         """Whether a query waits for this camera's next image."""

@@ -18,7 +18,6 @@ from companion.bus.messages import Localization
 from companion.bus.session import Bus
 from companion.bus.status_message import status_message
 from companion.guidance.core import Guidance
-from companion.guidance.grammar import describe
 from companion.host.tasks import keep_running, run_until
 from companion.operator.console import Ask, run_console, terminal_is_free
 from companion.operator.metrics import MetricsServer
@@ -48,7 +47,7 @@ class Service:
     Attributes:
         ready: commands are answered. parts: autopilot and cameras, which may still be missing.
         cameras: the cameras with their models, the first one first.
-        events: the newest, at most a hundred.
+        events: the newest, at most a hundred. target: how a console in this process reaches it.
 
     Args:
         settings: all of them.
@@ -85,10 +84,11 @@ class Service:
             on_calibration=self._on_calibration,
         )
         self.inputs = InputAssembler(settings, self.cameras, self._event)
-        identity, now_ns = self.inputs.poses.source, time.monotonic_ns()
-        self.others = OtherCommanders(settings.vehicle, identity, now_ns, self._event)
+        identity = self.inputs.poses.source
+        self.others = OtherCommanders(settings.vehicle, identity, time.monotonic_ns(), self._event)
         self._live = LiveSettings(settings, self.driver, self.inputs, self.cameras, self._event)
         self._queries = Queries(self._live, self.status)
+        self.target = self._queries.target(self.command)
         self.bus = Bus(
             settings.zenoh,
             settings.vehicle.name,
@@ -151,7 +151,7 @@ class Service:
             loops.append(keep_running("status", self._publish_status, self._event))
             loops.append(keep_running("vehicle messages", publish, self._event))
             if self._console and all(terminal_is_free(camera.settings.source.uri) for camera in self.cameras):
-                loops.append(run_console(self.command, self.stop, describe(), self._event, self._ask))
+                loops.append(run_console({"": self.target}, self.stop, self._event, self._ask))
             tasks = [asyncio.create_task(loop) for loop in loops]
             self._notifier.ready("ready")
             self._event("info", f"ready: commands on {topics.command_key(self.settings.vehicle.name)}")

@@ -12,7 +12,6 @@ from typing import Any
 
 from companion.bus.config import EndpointTakenError
 from companion.dashboard.process import dashboard_process
-from companion.guidance import grammar
 from companion.language.process import AskProcess
 from companion.operator.console import run_console, terminal_is_free
 from companion.service import Event, Service
@@ -163,9 +162,8 @@ async def _until_stopped(
             _print_next_commands(services, options.cameras, scene, say)
             if terminal_is_free(settings.source.uri):
                 await run_console(
-                    _commands_of(services),
+                    {service.settings.vehicle.name: service.target for service in services},
                     stop.set,
-                    grammar.describe(),
                     lambda level, text: say(text),
                     AskProcess(services[0].settings),
                 )
@@ -253,19 +251,6 @@ def _with(settings: Settings, **sections: dict[str, Any]) -> Settings:
 
 def _printer(say: Say, vehicle: str | None) -> Callable[[Event], None]:
     return lambda event: say(event.text if vehicle is None else f"{vehicle}: {event.text}")
-
-
-def _commands_of(services: list[Service]) -> Callable[[str], Any]:
-    """Return the console's handler: `vehicle2 takeoff 5` goes to that vehicle, others to the first."""
-    by_name = {service.settings.vehicle.name: service for service in services}
-
-    async def command(text: str) -> dict[str, Any]:
-        first_word, _, rest = text.partition(" ")
-        if rest and first_word in by_name:
-            return await by_name[first_word].command(rest.strip())
-        return await services[0].command(text)
-
-    return command
 
 
 def _print_next_commands(services: list[Service], cameras: int, scene: Scene, say: Say) -> None:

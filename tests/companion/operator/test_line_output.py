@@ -171,3 +171,35 @@ def test_service_works_with_an_unread_log(filming: list[str], pipe: Pipe, tmp_pa
         finally:
             process.kill()
             process.wait()
+
+
+def read_until(reading: int, end: bytes) -> bytes:
+    read = b""
+    while not read.endswith(end):
+        read += os.read(reading, 65536)
+    return read
+
+
+def test_what_is_shown_stays_below_the_lines(pipe: Pipe) -> None:
+    reading, writing = pipe
+    output = LineOutput(writing)
+    output.show("> hol")
+    assert read_until(reading, b"> hol") == b"\r\x1b[K> hol"
+    output.print("an event")
+    assert read_until(reading, b"> hol") == b"\r\x1b[Kan event\n\r\x1b[K> hol"
+    output.redraw()
+    assert read_until(reading, b"> hol") == b"\r\x1b[K> hol"
+    assert output.end(10.0)
+    os.close(writing)
+    assert os.read(reading, 100) == b"\r\x1b[K"
+
+
+def test_stalled_reader_gets_the_newest_that_is_shown(pipe: Pipe) -> None:
+    reading, writing = pipe
+    before = fill(writing)
+    output = LineOutput(writing)
+    for number in range(10_000):
+        output.show(f"> {number}")
+    read = read_until(reading, b"> 9999")[before:]
+    assert len(read) < 100  # at most one that was being written before
+    assert output.end(10.0)
