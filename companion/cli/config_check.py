@@ -26,7 +26,6 @@ from companion.settings.reading import ConfigurationError
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 from companion.vehicle.signing import read_key
-from vision.detector import check_detector
 from vision.extras import install_command
 from vision.sources.opening import check_address
 from vision.sources.source import SourceError, SourceUnavailableError
@@ -167,6 +166,8 @@ class _Check:
         if problem := settings.camera.lens_problem():
             self.missing.append(f"{prefix}camera: {problem}")
         if detector.enabled:
+            from vision.detector import check_detector  # a twelfth of a service's imports
+
             with self.fault(f"{prefix}detector"):
                 check_detector(detector.kind, detector.loading(detector.confidence))
         if settings.recording.video is not None:
