@@ -22,7 +22,16 @@ import zenoh
 
 from companion.bus.client import listen
 from mavlink_sim.testing import free_port
-from tests.companion.ros2.ros_process import EACH_ROS, ROOT, BusSide, bus, domain, ros_peer, running_node
+from tests.companion.ros2.ros_process import (
+    EACH_ROS,
+    ROOT,
+    BusSide,
+    RosPeer,
+    bus,
+    domain,
+    ros_peer,
+    running_node,
+)
 from tests.companion.service_process import heartbeats, running_service
 from tests.programs import ROS_PYTHONS
 from vision.frame import Frame
@@ -172,40 +181,54 @@ def latency_s(messages: list[dict[str, Any]]) -> float:
     return float(statistics.median(each["published_ns"] - each["captured_ns"] for each in messages)) / 1e9
 
 
-@pytest.mark.parametrize("kind", ["bgr8", "jpeg"])
+def check_stamps(what: str, camera: Publisher, detections: Detections) -> None:
+    """Assert that frames have the times at which their images were published, and that none is late."""
+    messages = detections.next(90)
+    of_shared = detections.next(90, "shared")
+    assert {(each["width"], each["height"]) for each in messages} == {(WIDTH, HEIGHT)}
+    assert max(camera.nearest_ns(each["captured_ns"]) for each in messages) <= TOLERANCE_NS
+    assert len({each["captured_ns"] for each in messages}) == 90
+    later_s = latency_s(messages) - latency_s(of_shared)
+    print(f"{what}: {latency_s(of_shared) * 1e3:.2f} ms, {later_s * 1e3:.2f} ms later")
+    assert later_s < LATER_S
+
+
+def check_stamps_of_messages(camera: Publisher, peer: RosPeer) -> None:
+    """Assert that messages of ROS about an image have exactly its stamp, in the time of ROS."""
+    answer = "/drone1/detections"
+    peer.subscribe(answer, "vision_msgs/msg/Detection2DArray")
+    stamps = [peer.message(answer)["header"]["stamp"] for _ in range(30)]
+    seen_ns = {stamp["sec"] * 1_000_000_000 + stamp["nanosec"] for stamp in stamps}
+    assert len(seen_ns) == 30
+    away_ns = [min(abs(each - sent) for sent in camera.stamps) for each in seen_ns]
+    assert set(away_ns) == {0}, f"median {statistics.median(away_ns)} ns"
+
+
 @pytest.mark.parametrize("ros", EACH_ROS)
-def test_stamps_of_ros_are_those_of_the_detections(
-    ros: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_stamps_of_raw_images_are_those_of_the_detections(
+    ros: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     profile = tmp_path / "fast_dds.xml"
     profile.write_text(FAST_DDS)
     for variable in ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"):
         monkeypatch.setenv(variable, str(profile))
-    topic = "/camera/image_raw" + ("/compressed" if kind == "jpeg" else "")
-    uri = f"ros:/{topic}"
+    topic = "/camera/image_raw"
     with (
         shared_at_the_same_rate() as shared,
-        publisher(ros, topic, kind) as camera,
-        service_and_node(ros, tmp_path, uri, shared) as detections,
+        publisher(ros, topic, "bgr8") as camera,
+        service_and_node(ros, tmp_path, f"ros:/{topic}", shared) as detections,
     ):
-        (first,) = detections.next()
-        assert (first["width"], first["height"]) == (WIDTH, HEIGHT)
-        messages = detections.next(90)
-        of_shared = detections.next(90, "shared")
-    assert max(camera.nearest_ns(each["captured_ns"]) for each in messages) <= TOLERANCE_NS
-    assert len({each["captured_ns"] for each in messages}) == 90
-    later_s = latency_s(messages) - latency_s(of_shared)
-    print(f"{ros} {kind}: {latency_s(of_shared) * 1e3:.2f} ms, {later_s * 1e3:.2f} ms later")
-    assert later_s < LATER_S
+        check_stamps(f"{ros} bgr8", camera, detections)
 
 
 @pytest.mark.parametrize("ros", EACH_ROS)
-def test_camera_of_ros_that_is_started_again_is_seen_again(ros: str, tmp_path: Path) -> None:
+def test_jpegs_of_ros_keep_their_stamps_and_come_again(ros: str, tmp_path: Path) -> None:
     topic = "/camera/image_raw/compressed"
     with shared_at_the_same_rate() as shared, ExitStack() as stack:
-        with publisher(ros, topic, "jpeg"):
+        with publisher(ros, topic, "jpeg") as camera:
             detections = stack.enter_context(service_and_node(ros, tmp_path, f"ros:/{topic}", shared))
-            detections.next(5)
+            check_stamps(f"{ros} jpeg", camera, detections)
+            check_stamps_of_messages(camera, stack.enter_context(ros_peer(ros)))
         with publisher(ros, topic, "jpeg") as camera:
             while not camera.sent or detections.next()[0]["captured_ns"] < camera.sent[0] - TOLERANCE_NS:
                 pass
@@ -220,29 +243,13 @@ def test_simulated_time_becomes_the_time_of_capture(ros: str, tmp_path: Path) ->
         shared_at_the_same_rate() as shared,
         publisher(ros, topic, "jpeg", clock_speed=0.5) as camera,
         service_and_node(ros, tmp_path, f"ros:/{topic}", shared, *arguments) as detections,
+        ros_peer(ros) as peer,
     ):
         detections.next(10)
         differences_ns = [camera.nearest_ns(each["captured_ns"]) for each in detections.next(30)]
-    # As exact as the steps of /clock.
-    assert statistics.median(differences_ns) < 10_000_000
-
-
-@pytest.mark.parametrize("clock_speed", [0.0, 0.5])
-@pytest.mark.parametrize("ros", EACH_ROS)
-def test_messages_about_an_image_have_its_stamp(ros: str, clock_speed: float, tmp_path: Path) -> None:
-    topic, answer = "/camera/image_raw/compressed", "/drone1/detections"
-    arguments = ("--", "--ros-args", "-p", "use_sim_time:=true") if clock_speed else ()
-    with shared_at_the_same_rate() as shared, ExitStack() as stack:
-        camera = stack.enter_context(publisher(ros, topic, "jpeg", clock_speed=clock_speed))
-        detections = stack.enter_context(service_and_node(ros, tmp_path, f"ros:/{topic}", shared, *arguments))
-        peer = stack.enter_context(ros_peer(ros))
-        detections.next(10)
-        peer.subscribe(answer, "vision_msgs/msg/Detection2DArray")
-        stamps = [peer.message(answer)["header"]["stamp"] for _ in range(30)]
-    seen_ns = {stamp["sec"] * 1_000_000_000 + stamp["nanosec"] for stamp in stamps}
-    assert len(seen_ns) == 30
-    away_ns = [min(abs(each - sent) for sent in camera.stamps) for each in seen_ns]
-    assert set(away_ns) == {0}, f"median {statistics.median(away_ns)} ns"
+        # As exact as the steps of /clock.
+        assert statistics.median(differences_ns) < 10_000_000
+        check_stamps_of_messages(camera, peer)
 
 
 @pytest.mark.parametrize("ros", EACH_ROS)
