@@ -94,7 +94,7 @@ def image_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def filming(image_folder: Path) -> list[str]:
     """Flags for a service that reads the images, ten a second, without detection."""
     return [
