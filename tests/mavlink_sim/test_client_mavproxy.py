@@ -17,13 +17,14 @@ from pathlib import Path
 import pytest
 
 from mavlink_sim.physics.geography import HOME_ALTITUDE_M
-from mavlink_sim.testing import RunningSimulator, vehicle
+from mavlink_sim.testing import QUICK_FLIGHT, RunningSimulator, vehicle
 from tests.programs import MAVPROXY
 
 pytestmark = [pytest.mark.needs("MAVProxy"), pytest.mark.realtime]
 MODULES = "param,arm,mode,wp,cmdlong,link,misc"
 # PX4's main and sub modes: MAVProxy 1.8.75 knows their names, but hands pymavlink all three numbers as one
 TAKEOFF, MISSION, LAND = "4 2", "4 4", "4 6"
+PX4, COPTER = ("px4", QUICK_FLIGHT), ("ardupilot", {"LAND_SPEED": 200})
 
 
 class Console:
@@ -99,9 +100,8 @@ class Console:
 @pytest.fixture
 def simulator(request: pytest.FixtureRequest) -> Iterator[RunningSimulator]:
     # MAVProxy cannot keep up with a faster one
-    autopilot = getattr(request, "param", "px4")
-    quick = {"LAND_SPEED": 200} if autopilot == "ardupilot" else {}
-    with vehicle(autopilot=autopilot, parameters=quick) as running:
+    autopilot, parameters = getattr(request, "param", PX4)
+    with vehicle(autopilot=autopilot, parameters=parameters) as running:
         yield running
 
 
@@ -115,6 +115,8 @@ def console(simulator: RunningSimulator, tmp_path: Path) -> Iterator[Console]:
         mavproxy.end()
 
 
+# With QUICK_FLIGHT from the start its `param fetch` does not end: cause not known.
+@pytest.mark.parametrize("simulator", [("px4", {})], ids=["px4"], indirect=True)
 def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, console: Console) -> None:
     count = int(console.wait_for(r"Received (\d+) parameters")[1])
     since = console.type("param fetch")
@@ -124,6 +126,9 @@ def test_it_connects_sets_parameters_and_flies(simulator: RunningSimulator, cons
     console.ask("param show MIS_TAKEOFF_ALT", r"MIS_TAKEOFF_ALT\s+1\.5")
     console.type("param set NAV_RCL_ACT 3")  # an integer, bytewise
     console.ask("param show NAV_RCL_ACT", r"NAV_RCL_ACT\s+3")
+    for name, value in QUICK_FLIGHT.items():
+        console.type(f"param set {name} {value:g}")
+        console.ask(f"param show {name}", rf"{name}\s+{value:g}")
 
     console.ask("disarm", "COMPONENT_ARM_DISARM: ACCEPTED")  # it is disarmed: no error
     console.type(f"long DO_SET_MODE 1 {TAKEOFF}")
@@ -150,7 +155,7 @@ def test_takeoff_altitude_is_amsl_as_in_px4(simulator: RunningSimulator, console
     assert float(height[1]) == pytest.approx(-4.0, abs=0.8)
 
 
-@pytest.mark.parametrize("simulator", ["ardupilot"], indirect=True)
+@pytest.mark.parametrize("simulator", [COPTER], ids=["ardupilot"], indirect=True)
 def test_a_copter_is_flown_by_the_names_of_its_modes(simulator: RunningSimulator, console: Console) -> None:
     console.wait_for(r"Received (\d+) parameters")
     console.ask("mode GUIDED", "Mode GUIDED")
