@@ -194,20 +194,6 @@ def test_invalid_setting_is_one_line_with_key_and_range(tmp_path: Path) -> None:
     assert "0 to 1" in line
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        ("--vehicle-url", "serial:///dev/ttyS0:12345"),
-        ("--vehicle-signing-key-file", "no.key"),
-        ("--plugins-modules", "no_such_plugin"),
-        ("--zenoh-config-file", "no.json5"),
-    ],
-)
-def test_wrong_settings_end_run_with_one_line(wrong: tuple[str, str], tmp_path: Path) -> None:
-    done = companion("run", "--source", "none", *wrong, cwd=tmp_path)
-    assert wrong[1] in one_line_of_bad_input(done)
-
-
 def test_view_is_run_without_a_vehicle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shown: list[Settings] = []
     monkeypatch.setattr("companion.cli.view.run_service", lambda settings, _: shown.append(settings))
@@ -238,18 +224,9 @@ def test_play_with_an_own_source_names_the_command(tmp_path: Path) -> None:
     )
 
 
-def test_unopenable_source_ends_run_with_one_line(tmp_path: Path) -> None:
-    done = companion(
-        "run", "--source", tmp_path / "no.mp4", "--detector-enabled", "false",
-        "--vehicle-url", f"udpin://127.0.0.1:{free_port()}",
-        "--zenoh-listen", f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}", cwd=tmp_path,
-    )  # fmt: skip
-    assert "no.mp4" in one_line_of_bad_input(done)
-
-
 def test_send_without_a_service_is_one_line(tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
-    line = one_line_of_bad_input(companion("send", "hold", "--connect", endpoint, cwd=tmp_path))
+    line = one_line_of_bad_input(companion_here("send", "hold", "--connect", endpoint, cwd=tmp_path))
     assert endpoint in line
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import os
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +16,7 @@ import pytest
 
 from companion.host.passing import EXIT_PASSING
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import companion, companion_here
+from tests.companion.command_line import COLUMNS, companion_here
 
 pytestmark = pytest.mark.realtime
 
@@ -43,6 +45,50 @@ def ports() -> Iterator[Ports]:
         yield Ports(tcp, udp, free_port(socket.SOCK_STREAM))
 
 
+# Each command has a process of its own, which this one forks: the modules are imported once.
+FORKS = """
+import json, os, sys
+import companion.cli.config_check, companion.service, companion.simulation.play
+from companion import cli
+for line in sys.stdin:
+    arguments, folder = json.loads(line)
+    child = os.fork()
+    if child == 0:
+        os.chdir(folder)
+        for number, name in enumerate((os.devnull, "stdout", "stderr")):
+            os.dup2(os.open(name, os.O_RDWR | os.O_CREAT), number)
+        sys.argv = ["companion", *arguments]
+        cli.main()
+        sys.exit()
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+
+
+@pytest.fixture(scope="module")
+def companion_forked() -> Iterator[Callable[[list[str], Path], subprocess.CompletedProcess[str]]]:
+    kept = {key: value for key, value in os.environ.items() if not key.startswith("COMPANION_")}
+    forking = subprocess.Popen(
+        [sys.executable, "-c", FORKS], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=kept | COLUMNS
+    )
+    assert forking.stdin is not None
+    assert forking.stdout is not None
+    given, codes = forking.stdin, forking.stdout
+
+    def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+        given.write(json.dumps([arguments, str(folder)]).encode() + b"\n")
+        given.flush()
+        code = int(codes.readline())
+        return subprocess.CompletedProcess(
+            arguments, code, (folder / "stdout").read_text(), (folder / "stderr").read_text()
+        )
+
+    try:
+        yield run
+    finally:
+        forking.kill()
+        forking.communicate()
+
+
 # Refused before the command changes its process: in this one.
 AT_ONCE = ("view village.png", "view --dashboard-listen nonsense")
 # Command line, exit code, and what its last line names.
@@ -62,12 +108,27 @@ CASES = [
     ("view --dashboard-listen 127.0.0.1:{tcp}", EXIT_PASSING, "{tcp}"),
     ("view --dashboard-listen nonsense", WRONG, "HOST:PORT"),
     ("run --source - --detector-kind none-such {free}", WRONG, "none-such"),
+    ("run --source no.mp4 --detector-enabled false --vehicle-url none {free}", WRONG, "no.mp4"),
+    *(
+        (f"run --source none {flag} {value} {{free}}", WRONG, value)
+        for flag, value in (
+            ("--vehicle-url", "serial:///dev/ttyS0:12345"),
+            ("--vehicle-signing-key-file", "no.key"),
+            ("--plugins-modules", "no_such_plugin"),
+            ("--zenoh-config-file", "no.json5"),
+        )
+    ),
 ]
 
 
 @pytest.mark.parametrize(("command", "code", "named"), CASES)
 def test_passing_failure_and_wrong_settings_differ(
-    command: str, code: int, named: str, ports: Ports, tmp_path: Path
+    command: str,
+    code: int,
+    named: str,
+    ports: Ports,
+    companion_forked: Callable[[list[str], Path], subprocess.CompletedProcess[str]],
+    tmp_path: Path,
 ) -> None:
     if "metrics" in command:
         pytest.importorskip("prometheus_client", reason="prometheus_client is an optional extra")
@@ -78,12 +139,16 @@ def test_passing_failure_and_wrong_settings_differ(
         "here": tmp_path / "photos",
         "free": f"--zenoh-listen tcp/127.0.0.1:{ports.free} --dashboard-listen=",
     }
-    run = companion_here if command.startswith(AT_ONCE) else companion
-    done = run(*command.format(**words).split(), cwd=tmp_path)
+    arguments = command.format(**words).split()
+    if command.startswith(AT_ONCE):
+        done = companion_here(*arguments, cwd=tmp_path)
+    else:
+        done = companion_forked(arguments, tmp_path)
     assert done.returncode == code, done.stderr
-    last = done.stderr.splitlines()[-1]
-    assert last.startswith("companion: ")
-    assert named.format(**words) in last
+    assert done.stdout == "" or arguments[0] != "run"
+    lines = done.stderr.splitlines()
+    assert [line for line in lines if line.startswith("companion: ")] == lines[-1:]
+    assert named.format(**words) in lines[-1]
     assert "Traceback" not in done.stderr
 
 

@@ -18,7 +18,7 @@ from companion.bus.session import zenoh_config
 from companion.bus.topics import command_key
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import companion, companion_here
+from tests.companion.command_line import companion_here
 from tests.companion.dashboard.serving import EventStream, dashboard_command
 from tests.companion.dashboard.test_bridge import publishing
 
@@ -68,7 +68,7 @@ def test_of_several_vehicles_one_must_be_named(words: tuple[str, ...], tmp_path:
     if words[0] == "mcp":
         pytest.importorskip("mcp")
     with services("vehicle1", "hawk") as (endpoint, received):
-        done = companion(*words, "--connect", endpoint, cwd=tmp_path)
+        done = companion_here(*words, "--connect", endpoint, cwd=tmp_path)  # before it serves or records
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert "hawk, vehicle1" in line
