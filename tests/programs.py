@@ -109,6 +109,9 @@ NEEDS = {
         "H.264, and video in a player of GStreamer",
         debian=" ".join(GSTREAMER),
     ),
+    "mavlink-router": Need(
+        shutil.which("mavlink-routerd") is not None, "a real MAVLink router", "docs/boards.md"
+    ),
     "autopilot": Need("COMPANION_SITL_URL" in os.environ, "SITL", "docs/how-to/sitl.md"),
     "test data": Need(DATA.is_dir(), "real flights, photographs and networks", "COMPANION_TEST_DATA"),
 }

@@ -61,6 +61,7 @@ NOT_RUN = {
     "companion models pull": "downloads",
     "sudo ": "a board with systemd",
     "cd /opt/companion": "a board with systemd",
+    "/opt/companion/current": "a board with systemd",
     "make test": "this test",
     "make programs": "a download",
     "make lint": "minutes, for all files",
@@ -103,6 +104,7 @@ REPEATED = {"policies.md": ("companion play", "companion send")}
 QUICK = ("companion play", "takeoff", "--camera")
 # What the reader has running beforehand: in place of an autopilot's SITL the simulated vehicle.
 RUNNING = {
+    "boards.md": ("mavlink-sim",),
     "sitl.md": ("mavlink-sim",),
     "troubleshooting.md": (
         "mavlink-sim",
