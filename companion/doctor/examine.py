@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 
 from companion.doctor import (
+    autopilot_ports,
     board,
     camera_device,
     heartbeats,
@@ -43,13 +44,14 @@ KINDS: tuple[CheckKind, ...] = (
     *serial_line.CHECKS,
     *ports.CHECKS,
     *heartbeats.CHECKS,
+    *autopilot_ports.CHECKS,
     *camera_device.CHECKS,
     *model.CHECKS,
     *board.CHECKS,
 )
-"""All kinds of checks. Those of `running` need a service, `heartbeats` none."""
+"""All kinds of checks. Those of `running` and `autopilot_ports` need a service, `heartbeats` none."""
 # What a service on another computer has is not looked for here.
-_OF_ANOTHER = running.CHECKS
+_OF_ANOTHER = (*running.CHECKS, *autopilot_ports.CHECKS)
 # With settings that cannot be read it is not known which devices are meant.
 _WITHOUT_SETTINGS = (*installation.CHECKS, *running.CHECKS, *board.CHECKS)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import companion
-from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.service import EventBody, PortParametersBody, StatusBody
 from companion.bus.bodies.vehicle import VehicleBody
 from companion.doctor.check import Check, unknown
 from companion.doctor.listening import Received
@@ -115,6 +115,7 @@ class Service:
         vehicle: its name. here: it runs on this computer.
         statuses: the newest of each second, oldest first; empty: it is there and silent.
         events: kept ones, oldest first.
+        ports: parameters of the autopilot's serial ports; None: not requested, or no answer.
     """
 
     vehicle: str
@@ -122,6 +123,7 @@ class Service:
     statuses: tuple[StatusBody, ...] = ()
     state: VehicleBody | None = None
     events: tuple[EventBody, ...] = ()
+    ports: PortParametersBody | None = None
 
     @property
     def status(self) -> StatusBody | None:

@@ -8,14 +8,14 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Self
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Self, cast
 
 import zenoh
 from zenoh import ext
 
-from companion.bus.bodies.service import EventBody, StatusBody
+from companion.bus.bodies.service import EventBody, PortParametersBody, StatusBody
 from companion.bus.bodies.vehicle import VehicleBody
 from companion.bus.client import (
     NoAnswerError,
@@ -36,6 +36,8 @@ _CONNECT_S = 1.0
 # `status` comes once a second; a second service of the same name is seen within this time.
 _LEAST_S, _MOST_S = 1.3, 3.0
 _QUERY_S = 1.5
+# Of 12 parameters that an autopilot does not have, and of the others.
+_PORTS_S = 5.5
 _POLL_S = 0.05
 _STATUSES = 5
 
@@ -68,7 +70,10 @@ def find_service(zenoh_section: ZenohSection, named: str | None) -> Found:
             chosen = named if named is not None else names[0] if len(names) == 1 else None
             if chosen in names and chosen is not None:
                 with ServiceWatch(session, chosen, here=all(map(is_here, client.connect))) as watch:
-                    return Found(watch.collect(), settings_of(session, chosen))
+                    # It answers while the rest is collected.
+                    replies = session.get(f"{ROOT}/{chosen}/port_parameters", timeout=_PORTS_S)
+                    service, settings = watch.collect(), settings_of(session, chosen)
+                    return Found(replace(service, ports=_ports_of(replies)), settings)
             return Found(instead=_not_chosen(names, named, where))
     except RefusedError as error:
         hangs = "if it is a service that hangs, on the ground: sudo systemctl restart companion"
@@ -171,6 +176,15 @@ def settings_of(session: zenoh.Session, vehicle: str) -> Settings | None:
         for reply in session.get(f"{ROOT}/{vehicle}/config", timeout=_QUERY_S):
             if reply.ok is not None:
                 return Settings.from_json(parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES)))
+    return None
+
+
+def _ports_of(replies: Iterable[zenoh.Reply]) -> PortParametersBody | None:
+    with contextlib.suppress(PeerDataError, zenoh.ZError):
+        for reply in replies:
+            if reply.ok is not None:
+                body = parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES))
+                return cast(PortParametersBody, body)
     return None
 
 

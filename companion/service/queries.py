@@ -1,4 +1,4 @@
-"""Answers the queries besides `command`: status, settings, the newest image, models, command grammar."""
+"""Answers the queries besides `command`: status, settings, images, models, ports, command grammar."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Awaitable, Callable, Sequence
 from typing import Any
 
-from companion.bus.bodies.service import ModelBody, ModelsBody, StatusBody
+from companion.bus.bodies.service import ModelBody, ModelsBody, PortParametersBody, StatusBody
 from companion.bus.session import QueryHandler
 from companion.bus.topics import IMAGE
 from companion.guidance.grammar import json_schema
@@ -16,6 +16,8 @@ from companion.operator.console import Target
 from companion.perception.cameras import WorkerCamera
 from companion.perception.supervisor import PerceptionState
 from companion.service.live_settings import LiveSettings
+from companion.vehicle.driver import Driver
+from companion.vehicle.port_parameters import read_port_parameters
 from vision.model_files import kept_models
 from vision.redaction import without_password
 
@@ -30,10 +32,13 @@ class Queries:
 
     Args:
         status: returns the state of the service.
+        driver: whose autopilot's parameters are read.
     """
 
-    def __init__(self, live: LiveSettings, status: Callable[[], StatusBody]) -> None:
-        self._live, self._status = live, status
+    def __init__(self, live: LiveSettings, status: Callable[[], StatusBody], driver: Driver) -> None:
+        self._live, self._status, self._driver = live, status, driver
+        self._reading = asyncio.Lock()
+        self._ports: tuple[int, dict[str, float]] = (0, {})  # of which opening of the link
         self._cameras: Sequence[WorkerCamera] = ()
         self._waiting: dict[str | None, list[asyncio.Future[bytes]]] = defaultdict(list)
 
@@ -46,6 +51,7 @@ class Queries:
             "config": self._config,
             "models": self._models,
             "commands": self._commands,
+            "port_parameters": self._port_parameters,
             **images,
         }
 
@@ -91,6 +97,18 @@ class Queries:
     async def _commands(self) -> dict[str, Any]:
         steering = next(camera for camera in self._cameras if camera.name == self._live.now.guidance.camera)
         return json_schema(steering.class_names)
+
+    async def _port_parameters(self) -> PortParametersBody:
+        """Read them once for each connection: the autopilot has to restart for another value of most."""
+        async with self._reading:
+            state, link_count = self._driver.state, self._driver.link_count
+            if not state.connected(self._driver.watch.now_ns()):
+                return {"parameters": {}, "not_read": "no autopilot"}
+            if self._ports[0] != link_count:
+                if state.armed:
+                    return {"parameters": {}, "not_read": "the vehicle is armed"}
+                self._ports = (link_count, await read_port_parameters(self._driver))
+            return {"parameters": self._ports[1], "not_read": ""}
 
     def _image_of(self, camera: WorkerCamera) -> QueryHandler:
         async def image() -> bytes:

@@ -87,7 +87,7 @@ class Service:
         identity = self.inputs.poses.source
         self.others = OtherCommanders(settings.vehicle, identity, time.monotonic_ns(), self._event)
         self._live = LiveSettings(settings, self.driver, self.inputs, self.cameras, self._event)
-        self._queries = Queries(self._live, self.status)
+        self._queries = Queries(self._live, self.status, self.driver)
         self.target = self._queries.target(self.command)
         self.bus = Bus(
             settings.zenoh,

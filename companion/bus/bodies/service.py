@@ -444,6 +444,15 @@ class ModelBody(TypedDict):
     """of the network"""
 
 
+class PortParametersBody(TypedDict):
+    """The reply of `port_parameters`."""
+
+    parameters: dict[str, float]
+    """of the autopilot's serial ports, those that it has"""
+    not_read: str
+    """why they are not read; empty: they are"""
+
+
 class ModelsBody(TypedDict):
     """The reply of `models`."""
 

@@ -5,19 +5,23 @@ from __future__ import annotations
 import asyncio
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from jsonschema import Draft202012Validator
 
-from companion.bus.bodies.service import ModelsBody
+from companion.bus.bodies.service import ModelsBody, PortParametersBody
 from companion.bus.schema import schema_of
 from companion.guidance.command import COMMANDS
 from companion.perception.messages import Preview, Ready
-from companion.service import Service
+from companion.service import Service, queries
 from companion.service.queries import without_secrets
 from companion.settings.reading import load_settings
+from companion.vehicle.driver import Driver
+from companion.vehicle.state import VehicleState
 from tests.companion.bus.message_check import check_message, closed
 
 SECRET = "rtsp://admin:hunter2@10.0.0.5/stream?token=4711"
@@ -95,3 +99,36 @@ async def test_image_of_a_stopped_camera_is_an_error(monkeypatch: pytest.MonkeyP
     with pytest.raises(TimeoutError, match="stopped"):
         await reply(service, "image")
     assert not service._queries.image_wanted(service.cameras[0])
+
+
+async def test_ports_are_read_once_for_each_connection_on_the_ground(monkeypatch: pytest.MonkeyPatch) -> None:
+    service = service_of()
+    validator = Draft202012Validator(closed(schema_of(PortParametersBody)))
+    readings: list[int] = []
+
+    async def read(driver: Driver) -> dict[str, float]:
+        readings.append(driver.link_count)
+        return {"MAV_1_CONFIG": 102.0}
+
+    monkeypatch.setattr(queries, "read_port_parameters", read)
+    silent = await reply(service, "port_parameters")
+    validator.validate(silent)
+    assert silent["not_read"]
+
+    driver = SimpleNamespace(
+        state=VehicleState(heartbeat_ns=1, autopilot="PX4", armed=True),
+        link_count=1,
+        watch=SimpleNamespace(now_ns=lambda: 2),
+    )
+    monkeypatch.setattr(service._queries, "_driver", driver)
+    assert (await reply(service, "port_parameters"))["not_read"]
+    assert not readings
+
+    driver.state = replace(driver.state, armed=False)
+    both = await asyncio.gather(reply(service, "port_parameters"), reply(service, "port_parameters"))
+    assert both[0] == both[1] == {"parameters": {"MAV_1_CONFIG": 102.0}, "not_read": ""}
+    driver.state = replace(driver.state, armed=True)
+    assert await reply(service, "port_parameters") == both[0]
+    driver.state, driver.link_count = replace(driver.state, armed=False), 2
+    validator.validate(await reply(service, "port_parameters"))
+    assert readings == [1, 2]
