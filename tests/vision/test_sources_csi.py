@@ -236,3 +236,36 @@ def test_exposure_and_gain_are_arguments_of_the_program(board: Board) -> None:
 def test_board_without_program_names_the_packages(board: Board) -> None:
     with pytest.raises(SourceError, match=r"rpicam-apps.*gstreamer1\.0-tools, nvidia-l4t-gstreamer"):
         open_source("csi://0")
+
+
+# The Jetson's elements, and those of GStreamer that stand in for them, in one launch of the real program.
+GSTREAMER = """#!{python}
+import os, sys
+words = []
+for word in sys.argv[1:]:
+    if word == "nvarguscamerasrc":
+        words += ["videotestsrc", "is-live=true", "pattern=red"]
+    elif not word.startswith("sensor-id="):
+        word = {{"nvvidconv": "videoconvert", "nvjpegenc": "jpegenc"}}.get(word, word)
+        words.append(word.replace("(memory:NVMM)", ""))
+os.execv("/usr/bin/gst-launch-1.0", ["gst-launch-1.0", *words])
+"""
+
+
+@pytest.mark.needs("GStreamer")
+@pytest.mark.parametrize("pixel_format", ["yuv420", "mjpeg"])
+def test_pipeline_of_a_jetson_delivers_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pixel_format: str
+) -> None:
+    program = tmp_path / "gst-launch-1.0"
+    program.write_text(GSTREAMER.format(python=sys.executable))
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    wanted = SourceSettings(width=640, height=480, rate_hz=10.0, pixel_format=pixel_format)
+    with open_source("csi://0", wanted) as source:
+        for _ in range(3):
+            frame = source.read(20.0)
+            assert frame is not None
+            assert frame.image.shape == (480, 640, 3)
+            # jpegenc, of GStreamer, keeps the video's limited range.
+            assert np.abs(frame.image.mean((0, 1)) - (0, 0, 255)).max() < 20
