@@ -88,6 +88,7 @@ PROGRAMS = (
 OPERATORS_PROGRAMS = (
     "companion.cli.ask",
     "companion.cli.client",
+    "companion.cli.console",
     "companion.cli.doctor",
     "companion.cli.mcp",
     "companion.cli.ros2",
@@ -160,6 +161,7 @@ SINGLE_STEP_TESTS = {
 AWAITED_TASKS = {
     "companion/bench/setpoints.py",
     "companion/cli/ask.py",
+    "companion/cli/console.py",
     "companion/cli/run.py",
     "companion/dashboard/chat.py",
     "companion/ground_station/__main__.py",

@@ -106,6 +106,7 @@ QUICK = ("companion play", "takeoff", "--camera")
 RUNNING = {
     "boards.md": ("mavlink-sim",),
     "sitl.md": ("mavlink-sim",),
+    "systemd.md": ("companion run --source none --vehicle-url none",),
     "troubleshooting.md": (
         "mavlink-sim",
         "companion run --source none --vehicle-url udpin://127.0.0.1:14540",

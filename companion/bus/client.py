@@ -154,6 +154,25 @@ def only_vehicle(session: zenoh.Session) -> str | None:
     return names[0] if names else None
 
 
+def check_alive(session: zenoh.Session, vehicle: str) -> None:
+    """Check that a vehicle's service runs. Its token may arrive shortly after connecting.
+
+    Raises:
+        NoAnswerError: there is none.
+    """
+    until_s = time.monotonic() + _DISCOVERY_S
+    while vehicle not in alive_vehicles(session):
+        if time.monotonic() > until_s:
+            raise _no_service(vehicle)
+        time.sleep(0.05)
+
+
+def _no_service(vehicle: str) -> NoAnswerError:
+    return NoAnswerError(
+        f"no service for vehicle {vehicle!r}: check vehicle.name; `companion echo status` lists the services"
+    )
+
+
 class SettingsRefusedError(RuntimeError):
     """A service does not change its settings so. The message is one line."""
 
@@ -171,11 +190,12 @@ class LastStatus:
         """Time since the newest status; 0 before the first."""
         return 0.0 if self._newest is None else time.monotonic() - self._newest[1]
 
-    def gone_text(self, before: str) -> str:
+    def gone_text(self, before: str = "") -> str:
         """Return what a service that has gone leaves, and what to do. `before`: what it was to send."""
+        early = f" before {before}" if before else ""
         return (
-            f"the service of vehicle {self._vehicle!r} has gone before {before}: it was stopped or killed, "
-            f"or the network was lost. {self._vehicle_text()}"
+            f"the service of vehicle {self._vehicle!r} has gone{early}: it was stopped or killed, or the "
+            f"network was lost. {self._vehicle_text()}"
         )
 
     def silent_text(self) -> str:
@@ -232,10 +252,7 @@ def send_command(
             while not _is(received.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
                 pass
         except queue.Empty:
-            raise NoAnswerError(
-                f"no service for vehicle {vehicle!r}: check vehicle.name; "
-                "`companion echo status` lists the services"
-            ) from None
+            raise _no_service(vehicle) from None
         # Sent once: a command without an answer may be in progress.
         deadline_s = time.monotonic() + timeout_s
         replies = zenoh.handlers.Callback(received.put, lambda: received.put(None))

@@ -17,6 +17,7 @@ from companion.cli.ask import ASK_SETTINGS, ask
 from companion.cli.bench import bench
 from companion.cli.calibrate import calibrate
 from companion.cli.client import echo, known_commands, send
+from companion.cli.console import console
 from companion.cli.demo import demo
 from companion.cli.describe import describe
 from companion.cli.detect import DETECT_SETTINGS, detect
@@ -50,6 +51,7 @@ settings_command(app)(run)
 app.command(cls=Command)(demo)
 settings_command(app, *DETECT_SETTINGS, optional_values=("--markers",))(detect)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector", epilog=known_commands)(send)
+settings_command(app, *ASK_SETTINGS)(console)
 settings_command(app, *CLIENT_SETTINGS)(echo)
 settings_command(app, *CLIENT_SETTINGS)(status)
 settings_command(app)(doctor)

@@ -38,9 +38,7 @@ logger = logging.getLogger(__name__)
 EXAMPLES = "takeoff 5, seek car, approach car distance=5, hold, land, rtl, stop"
 _BANNER = f"type a command (help, quit): {EXAMPLES}"
 _ASK_BANNER = "or ask in plain words: ask find a car and circle it"
-_CONSOLE_ENDED = (
-    "the console has ended, the service goes on: Ctrl-C ends it, `companion console` opens another"
-)
+_CONSOLE_ENDED = "console ended, the service goes on: Ctrl-C ends it, `companion console` opens another"
 _PROMPT = "> "
 _CANCEL = "cancel"
 QUIT = ("quit", "exit")
