@@ -84,7 +84,7 @@ def describe(
     elif origin:
         _describe_origins(read_settings(), as_json=as_json)
     elif of_settings:
-        _describe_settings(read_settings().settings, check=check)
+        _describe_settings(read_settings(), check=check)
     else:
         _describe_cameras(as_json=as_json)
 
@@ -123,17 +123,27 @@ def _describe_topics(schema: Path | None, *, as_json: bool, as_markdown: bool) -
     Console(width=None if sys.stdout.isatty() else 160).print(table)
 
 
-def _describe_settings(settings: Settings, *, check: bool) -> None:
+def _describe_settings(layered: LayeredSettings, *, check: bool) -> None:
     from companion.settings.reading import ConfigurationError, to_toml, unknown_variables
 
     if check:
         from companion.cli.config_check import check_settings
 
         with plain_errors(ConfigurationError):
-            for line in (*unknown_variables(os.environ).values(), *check_settings(settings)):
+            try:
+                missing = [_with_file(line, layered) for line in check_settings(layered.settings)]
+            except ConfigurationError as error:
+                raise ConfigurationError(*(_with_file(line, layered) for line in error.problems)) from None
+            for line in (*unknown_variables(os.environ).values(), *missing):
                 typer.echo(marked_for_journal(f"companion: {line}", logging.WARNING), err=True)
         return
-    _print_redacted(to_toml(settings))
+    _print_redacted(to_toml(layered.settings))
+
+
+def _with_file(line: str, layered: LayeredSettings) -> str:
+    """Add where a file has the key that a line begins with."""
+    given = layered.given.get(line.partition(":")[0].partition(" ")[0])
+    return f"{line} ({given[-1].origin})" if given and given[-1].origin.kind == "file" else line
 
 
 def _describe_origins(layered: LayeredSettings, *, as_json: bool) -> None:

@@ -104,6 +104,19 @@ def test_check_is_of_the_merged_layers(files: tuple[Path, Path, Path]) -> None:
     assert companion_here(*check, "--config", "own.toml", cwd=work).returncode == 0
 
 
+def test_missing_device_is_said_with_its_line(files: tuple[Path, Path, Path]) -> None:
+    _, user, work = files
+    with user.open("a") as file:
+        file.write("[vehicle]\nurl = 'serial:///dev/ttyNone:57600'\nsigning_key_file = 'none.key'\n")
+    check = ("describe", "settings", "--check", "--source", "none")
+    done = companion_here(*check, cwd=work)
+    assert done.returncode == 2
+    assert [f"{user}, line 6" in line for line in done.stderr.splitlines()] == [True]
+    done = companion_here(*check, "--vehicle-signing-key-file", "none", cwd=work)
+    assert done.returncode == 0
+    assert [f"{user}, line 5" in line for line in done.stderr.splitlines()] == [True]
+
+
 def test_former_default_file_is_named_in_one_line(files: tuple[Path, Path, Path]) -> None:
     _, user, work = files
     (work / "companion.toml").write_text("[vehicle]\nname = 'stray'\n")
