@@ -6,7 +6,7 @@ import asyncio
 import signal
 import sys
 from contextlib import ExitStack
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -18,7 +18,16 @@ if TYPE_CHECKING:
     from companion.settings import Settings
 
 
-def console(settings: Settings) -> None:
+Python = Annotated[
+    bool,
+    typer.Option(
+        "--python",
+        help="A Python prompt, with the vehicle as `drone`: await drone.takeoff(5). Extra `service`.",
+    ),
+]
+
+
+def console(settings: Settings, python: Python = False) -> None:
     """Fly a running service from a terminal.
 
     Commands as in `companion send`, with completion by TAB and a history, while events are shown. Several can
@@ -35,6 +44,9 @@ def console(settings: Settings) -> None:
             session = stack.enter_context(open_client(client_settings(settings.zenoh)))
             vehicle = vehicle_of(session, settings)
             check_alive(session, vehicle)
+        if python:
+            asyncio.run(_prompt_python(session, vehicle))
+            return
         if not sys.stdin.isatty():
             raise typer.Exit(_answer_lines(session, vehicle))
         with plain_errors(OSError):
@@ -57,6 +69,18 @@ def _answer_lines(session: zenoh.Session, vehicle: str) -> int:
                 typer.echo(answer.text)
                 code = answer.code or code
     return code
+
+
+async def _prompt_python(session: zenoh.Session, vehicle: str) -> None:
+    """Read Python until Ctrl-D, with `await`. Ctrl-C cancels what is awaited: a command is then stopped."""
+    from aioconsole import interact
+
+    from companion.client.drone import Drone
+
+    banner = (
+        f"vehicle {vehicle!r} is `drone`: await drone.takeoff(5); Ctrl-D ends the prompt, the service goes on"
+    )
+    await interact(banner, locals={"drone": Drone(session, vehicle)}, stop=False)
 
 
 async def _attend(session: zenoh.Session, vehicle: str, settings: Settings) -> None:

@@ -204,3 +204,21 @@ def test_terminal_of_play_is_a_console(tmp_path: Path) -> None:
         terminal.type(CTRL_C)
         assert terminal.process.wait(30) == 0
         assert terminal.edits
+
+
+def test_python_prompt_awaits_the_client(tmp_path: Path) -> None:
+    lines = """
+body = await anext(drone.status())
+print("ready:", body["healthy"] in (True, False))
+try:
+    await drone.hold()
+except Exception as error:
+    print("error:", type(error).__name__)
+
+"""
+    with service_on_the_ground(tmp_path) as service:
+        done = piped(service.endpoint, lines, tmp_path, "--python")
+        assert done.returncode == 0, done.stderr
+    printed = done.stdout + done.stderr
+    assert "ready: True" in printed
+    assert "error: CommandFailedError" in printed
