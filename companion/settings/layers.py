@@ -79,7 +79,7 @@ def settings_files(config: Path | None = None, *, only_config: bool = False) -> 
         if _is_there(user, hidden=False):
             if (owner := _other_owner(user)) is None:
                 files.append(user)
-            else:
+            elif config is None or os.path.realpath(config) != os.path.realpath(user):
                 found = f"{user} is not read: it belongs to {owner}"
                 not_read.append(NotRead(found, f"--config {user} reads it"))
     if config is not None:

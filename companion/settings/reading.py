@@ -421,7 +421,9 @@ def _read_toml(path: Path) -> tuple[dict[str, Any], dict[str, int]]:
         text = read_text(path)
         return parse_toml(text), key_lines(text)
     except OSError as error:
-        raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
+        may = f"; make it readable, or leave all files out: --config {os.devnull}"
+        advice = may if isinstance(error, PermissionError) else ""
+        raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}{advice}") from error
     except UnicodeDecodeError as error:
         raise ConfigurationError(explained(path, f"{path}: {error}")) from error
     except tomllib.TOMLDecodeError as error:

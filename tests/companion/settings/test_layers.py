@@ -127,6 +127,22 @@ def test_hidden_folder_of_the_system_is_no_missing_file(
     assert settings_files().files == (places["system"],)
 
 
+def test_file_without_permission_is_named_with_what_to_do(
+    places: dict[str, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(path: Path) -> str:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    places["system"].touch()
+    monkeypatch.setattr("companion.settings.reading.read_text", refused)
+    with pytest.raises(ConfigurationError) as failure:
+        load_layers(settings_files(), environment={})
+    (line,) = failure.value.problems
+    assert str(places["system"]) in line
+    assert "--config /dev/null" in line
+    assert load_layers(settings_files(Path("/dev/null")), environment={}).files.files == ()
+
+
 def test_unreadable_file_is_an_error_with_its_name(places: dict[str, Path]) -> None:
     for layer in ("system", "user"):
         places[layer].mkdir()
@@ -156,6 +172,7 @@ def test_file_of_another_user_is_not_read(
         (not_read,) = files.not_read
         assert str(places["user"]) in not_read.found
         assert str(owner) in not_read.found
+    assert settings_files(places["user"]) == SettingsFiles((places["user"],))
 
 
 def test_file_of_the_working_folder_is_named_and_not_read(places: dict[str, Path]) -> None:
