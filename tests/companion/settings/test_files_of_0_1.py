@@ -1,6 +1,6 @@
-"""Files of version 0.1, most as it came with it and as its documents had them: read as before, or refused.
+"""Files of version 0.1, most as it came with it, without their comments, and as its documents had them.
 
-A refusal names each key that is not read as before, with its line and what it is now.
+The errors name each key that is not read as before, with its line and what it is now.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def test_every_file_is_in_the_table() -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_refusal_names_each_key_and_what_it_is_now(name: str) -> None:
+def test_errors_name_each_key_and_what_it_is_now(name: str) -> None:
     path = FOLDER / f"{name}.toml"
     text = path.read_text()
     lines = {key.replace("views.", "cameras."): line for key, line in key_lines(text).items()}
