@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 PROC = Path("/proc")
+_PSEUDO_TERMINALS = range(136, 144)  # major numbers of their near ends, by Linux's devices.txt
 
 
 def processes(proc: Path = PROC) -> list[int]:
@@ -33,7 +34,9 @@ def processes_with_file(file: Path, proc: Path = PROC) -> Iterator[int]:
 
 
 def _same(one: os.stat_result, other: os.stat_result) -> bool:
-    if stat.S_ISCHR(one.st_mode) and stat.S_ISCHR(other.st_mode):
+    # A pseudo-terminal of a container has the number of another one here.
+    pseudo = os.major(one.st_rdev) in _PSEUDO_TERMINALS
+    if stat.S_ISCHR(one.st_mode) and stat.S_ISCHR(other.st_mode) and not pseudo:
         return one.st_rdev == other.st_rdev
     return os.path.samestat(one, other)
 

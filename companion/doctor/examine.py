@@ -112,7 +112,7 @@ def tried(facts: Facts) -> Facts:
     for name, source in camera_device.sources(facts):
         if may_open(source, facts):
             cameras[name] = late
-            calls.append(partial(_try_camera, source, partial(cameras.__setitem__, name)))
+            calls.append(partial(_keep_trial, source, partial(cameras.__setitem__, name)))
     if not why_not:
         url = parse_link_url(facts.settings.vehicle.url)
         calls.append(lambda: received.append(listen(url, LISTEN_S)))
@@ -158,16 +158,21 @@ def may_open(source: SourceSection, facts: Facts) -> bool:
     return camera_device.is_free(device, facts)
 
 
-def _try_camera(source: SourceSection, keep: Callable[[CameraTrial], None]) -> None:
+def _keep_trial(source: SourceSection, keep: Callable[[CameraTrial], None]) -> None:
+    keep(camera_trial(source))
+
+
+def camera_trial(source: SourceSection) -> CameraTrial:
+    """Open a camera for a moment, at most some 7 s, and return what it delivers. Never raises for it."""
     opening = replace(source.opening(), depth=None, depth_scale=None, depth_calibration_file=None)
     opening = replace(opening, open_timeout_s=min(opening.open_timeout_s, _CAMERA_OPEN_S))
     try:
         with open_source(source.uri, opening) as opened:
-            keep(_delivered(opened))
+            return _delivered(opened)
     except EndOfStream:
-        keep(CameraTrial(problem=f"{source.uri}: has ended"))
+        return CameraTrial(problem=f"{source.uri}: has ended")
     except (SourceError, ValueError, ImportError) as error:
-        keep(CameraTrial(problem=str(error)))
+        return CameraTrial(problem=str(error))
 
 
 def _delivered(source: Source) -> CameraTrial:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 from pymavlink.dialects.v20 import common as mavlink
@@ -56,15 +57,25 @@ class Received:
     problem: str = ""
 
 
-def listen(url: LinkUrl, seconds: float) -> Received:
-    """Receive for a time. Never raises for the link."""
-    return asyncio.run(_listen(url, seconds))
+def listen(url: LinkUrl, seconds: float, enough: Callable[[Received], bool] | None = None) -> Received:
+    """Receive for a time. Never raises for the link.
+
+    Args:
+        enough: ends it earlier when it returns True for what was received so far.
+    """
+    return asyncio.run(_listen(url, seconds, enough))
 
 
-async def _listen(url: LinkUrl, seconds: float) -> Received:
+async def _listen(url: LinkUrl, seconds: float, enough: Callable[[Received], bool] | None) -> Received:
     framers: dict[Source, Framer] = {}
     senders: dict[Address, Sender] = {}
     frames = 0
+    ended = asyncio.Event()
+    began_s = time.monotonic()
+
+    def received() -> Received:
+        skipped = sum(framer.skipped_bytes for framer in framers.values())
+        return Received(time.monotonic() - began_s, senders, frames, skipped)
 
     def receive(data: bytes, source: Source) -> None:
         nonlocal frames
@@ -83,16 +94,18 @@ async def _listen(url: LinkUrl, seconds: float) -> Received:
                 is_signed(frame.raw),
                 sources if source is None else sources | {f"{source[0]}:{source[1]}"},
             )
+        if enough is not None and enough(received()):
+            ended.set()
 
-    began_s = time.monotonic()
     try:
         async with asyncio.timeout(seconds + 1.0):
             link = await open_link(url, receive)
     except (LinkError, TimeoutError) as error:
         return Received(problem=str(error) or f"{url}: no connection within {seconds + 1.0:g} s")
+    began_s = time.monotonic()
     try:
-        await asyncio.sleep(seconds)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(ended.wait(), seconds)
     finally:
         await link.close()
-    skipped = sum(framer.skipped_bytes for framer in framers.values())
-    return Received(time.monotonic() - began_s, senders, frames, skipped)
+    return received()

@@ -171,12 +171,13 @@ def _drops(facts: Facts) -> Iterator[Check]:
                 )
 
 
+VEHICLE_PORT = CheckKind(
+    "vehicle port",
+    "the UDP port of `vehicle.url` taken, and which program has it",
+    partial(_free, names=("vehicle port",)),
+)
 CHECKS = (
-    CheckKind(
-        "vehicle port",
-        "the UDP port of `vehicle.url` taken, and which program has it",
-        partial(_free, names=("vehicle port",)),
-    ),
+    VEHICLE_PORT,
     CheckKind("zenoh port", "the same of `zenoh.listen`", partial(_free, names=("zenoh port",))),
     CheckKind(
         "page port", "the same of `dashboard.listen`, Foxglove and metrics", partial(_free, names=_PAGES)

@@ -29,6 +29,15 @@ def serial_device(facts: Facts) -> Path | None:
     return facts.machine.path(url.address[0]) if url.scheme is LinkScheme.SERIAL else None
 
 
+def serial_devices(dev: Path) -> list[Path]:
+    """Return the serial devices at which an autopilot may be, each once, by its most lasting name."""
+    by_device: dict[Path, Path] = {}
+    for pattern in _CANDIDATES:
+        for path in sorted(dev.glob(pattern)):
+            by_device.setdefault(path.resolve(), path)
+    return list(by_device.values())
+
+
 def permission_problem(path: Path, user: User) -> tuple[str, str] | None:
     """Return why a user may not read and write a device, and the line that mends it; None: it may."""
     status = path.stat()
@@ -51,6 +60,8 @@ def possible_holders(path: Path, facts: Facts) -> list[Program]:
     """Return who has a serial device open, or may have, where descriptors of other users are not seen."""
     proc, device = facts.machine.proc, path.resolve().name
     held = holding_file(path, proc)
+    if device.isdecimal():  # a pseudo-terminal: many programs have a number as an argument
+        return held
     seen = {each.pid for each in held}
     for each in programs(proc):
         words = [Path(word).name for word in each.command if " " not in word]
@@ -79,8 +90,7 @@ def _there(facts: Facts) -> Iterator[Check]:
         real = path.resolve()
         yield ok("serial device", str(path) if real == path else f"{path} is {real}")
         return
-    found = [each for pattern in _CANDIDATES for each in sorted(facts.machine.dev.glob(pattern))]
-    if found:
+    if found := serial_devices(facts.machine.dev):
         here = ", ".join(map(str, found[:_MOST_CANDIDATES]))
         advice = f'set vehicle.url = "serial://{found[0]}:{facts.settings.vehicle.url.rpartition(":")[2]}"'
         yield fault("serial device", f"{path} is not there; there are {here}", advice)
