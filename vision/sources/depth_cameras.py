@@ -10,6 +10,7 @@ checked against the libraries (pyrealsense2 2.59, depthai 3.12) as far as they r
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import logging
 import os
 import time
@@ -43,6 +44,30 @@ def load_module(name: str, uri: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise SourceError(f"{uri}: needs {name}: {install_command(name)} ({error})") from error
+
+
+def depth_camera_addresses() -> list[str]:
+    """Addresses of the depth cameras that are connected, by the libraries that are installed."""
+    found: list[str] = []
+    for name, scheme, listed in (
+        ("pyrealsense2", "realsense", _realsense_serials),
+        ("depthai", "oak", _oak_identifiers),
+    ):
+        if importlib.util.find_spec(name) is None:
+            continue
+        try:
+            found += [f"{scheme}://{each}" for each in listed(importlib.import_module(name))]
+        except (ImportError, RuntimeError) as error:
+            logger.warning("%s finds no cameras: %s", name, error)
+    return found
+
+
+def _realsense_serials(module: Any) -> list[str]:
+    return [str(each.get_info(module.camera_info.serial_number)) for each in module.context().query_devices()]
+
+
+def _oak_identifiers(module: Any) -> list[str]:
+    return [str(each.getDeviceId()) for each in module.Device.getAllAvailableDevices()]
 
 
 def _size(settings: SourceSettings) -> tuple[int, int]:
