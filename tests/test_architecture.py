@@ -37,6 +37,7 @@ COMPANION_LAYERS = {
     "simulation": 9,
     "bench": 10,
     "learning": 10,
+    "setup": 10,
     "cli": 11,
 }
 # What people and other programs reach a flight by; and the parts of these inside the service, or that
@@ -51,6 +52,7 @@ INTERFACES = (
     "companion.operator",
     "companion.recording",
     "companion.ros2",
+    "companion.setup",
 )
 INTERFACES_INSIDE = {
     "companion.client",
@@ -90,6 +92,7 @@ OPERATORS_PROGRAMS = (
     "companion.cli.client",
     "companion.cli.console",
     "companion.cli.doctor",
+    "companion.cli.init",
     "companion.cli.mcp",
     "companion.cli.ros2",
     "companion.client.drone",

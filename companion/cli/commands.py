@@ -23,6 +23,7 @@ from companion.cli.describe import describe
 from companion.cli.detect import DETECT_SETTINGS, detect
 from companion.cli.doctor import doctor, status
 from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, Command, CompanionCommands, settings_command
+from companion.cli.init import init
 from companion.cli.learn import learn
 from companion.cli.log import log
 from companion.cli.markers import MARKER_SETTINGS, markers
@@ -53,6 +54,7 @@ settings_command(app, *DETECT_SETTINGS, optional_values=("--markers",))(detect)
 settings_command(app, *CLIENT_SETTINGS, "plugins", "detector", epilog=known_commands)(send)
 settings_command(app, *ASK_SETTINGS)(console)
 settings_command(app, *CLIENT_SETTINGS)(echo)
+app.command(cls=Command)(init)
 settings_command(app, *CLIENT_SETTINGS)(status)
 settings_command(app)(doctor)
 settings_command(app, *ASK_SETTINGS)(ask)

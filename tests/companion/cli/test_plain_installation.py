@@ -70,6 +70,7 @@ WALK: Walk = [
     ("detect", ("demo.png", "--runtime", "auto", "--image-size", "320"), ENDS),
     ("send", ("land", *NOBODY), ENDS),
     ("echo", ("detections", *NOBODY), ENDS),
+    ("init", (), ENDS),
     ("status", NOBODY, ENDS),
     ("doctor", (*NOBODY, "--vehicle-url", "none", "--source", "none"), ENDS),
     ("ask", ("land", *NOBODY), ENDS),
