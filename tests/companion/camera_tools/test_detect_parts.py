@@ -141,7 +141,7 @@ def test_images_without_an_autopilot_cannot_be_levelled(image_folder: Path, tmp_
 
 
 def test_cameras_are_one_json_object(tmp_path: Path) -> None:
-    done = companion("describe", "cameras", "--json", cwd=tmp_path)
+    done = companion_here("describe", "cameras", "--json", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     listed = json.loads(done.stdout)
     assert set(listed) == {"devices", "csi"}
@@ -164,7 +164,7 @@ def depth(image_folder: Path) -> Path:
 
 
 def test_depth_prints_the_messages_of_its_topics(image_folder: Path, depth: Path, tmp_path: Path) -> None:
-    done = companion(
+    done = companion_here(
         *DEPTH, image_folder, "--source-depth", depth, "--json", "--save", tmp_path / "out", cwd=tmp_path
     )
     assert done.returncode == 0, done.stderr
@@ -185,7 +185,7 @@ def test_depth_prints_the_messages_of_its_topics(image_folder: Path, depth: Path
 
 
 def test_depth_of_detections(image_folder: Path, depth: Path, tmp_path: Path, exported_model: Path) -> None:
-    done = companion(
+    done = companion_here(
         "detect", image_folder, "--source-depth", depth, "--source-depth-scale", "0.002", "--limit", "1",
         "--json", "--depth", "--model", exported_model, "--runtime", "onnxruntime", "--confidence", "0",
         "--image-size", "160", cwd=tmp_path,
