@@ -38,12 +38,14 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture(scope="session", autouse=True)
 def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Tests leave nothing in the user's cache and in the models folders, and find nothing there.
+    """Tests leave nothing in the user's cache, state and models folders, and find nothing there.
 
     They read no settings of this computer and of its user.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
+        patch.delenv("STATE_DIRECTORY", raising=False)
         patch.setenv("COMPANION_MODELS_FOLDER", str(tmp_path_factory.mktemp("models")))
         settings = tmp_path_factory.mktemp("settings")
         patch.setenv("XDG_CONFIG_HOME", str(settings))

@@ -60,7 +60,7 @@ def _autopilot(address: Address, sender: Sender, facts: Facts) -> Iterator[Check
     received = facts.received
     assert received is not None
     rate_hz = sender.heartbeats / received.seconds if received.seconds else 0.0
-    signed = "signed" if sender.signed else "not signed"
+    signed = "signed" if sender.signed else "without a signing key"
     text = (
         f"system {address[0]}, component {address[1]}: {type_text(sender.mav_type)} of "
         f"{autopilot_text(sender.autopilot)}, {rate_hz:.1f} a second, {signed}"
@@ -71,7 +71,7 @@ def _autopilot(address: Address, sender: Sender, facts: Facts) -> Iterator[Check
     elif sender.signed and not has_key:
         yield warning(NAME, text, "set vehicle.signing_key_file to a file with its key")
     elif has_key and not sender.signed:
-        yield fault(NAME, f"{text}: vehicle.signing_key_file refuses them", "send the key to the autopilot")
+        yield fault(NAME, f"{text}: vehicle.signing_key_file refuses them", "companion signing send")
     elif rate_hz < _LEAST_RATE_HZ:
         yield warning(NAME, text, "a second reader of the line, or a link that loses data")
     elif received.skipped_bytes:

@@ -12,8 +12,9 @@ from pymavlink.dialects.v20 import common as mavlink
 
 from companion.vehicle.byte_link import Source, open_link
 from companion.vehicle.driver import LinkError
-from companion.vehicle.framing import Framer, is_signed
+from companion.vehicle.framing import Framer
 from companion.vehicle.link_url import LinkUrl
+from companion.vehicle.signing import is_signed_with_a_key
 
 _HEARTBEAT = mavlink.MAVLINK_MSG_ID_HEARTBEAT
 Address = tuple[int, int]
@@ -26,7 +27,8 @@ class Sender:
 
     Attributes:
         mav_type, autopilot: MAV_TYPE and MAV_AUTOPILOT of the newest heartbeat.
-        heartbeats: how many. signed: the newest was. sources: network addresses that they came from.
+        heartbeats: how many. sources: network addresses that they came from.
+        signed: the newest was, and not with the key of zeros that PX4 has without one.
     """
 
     mav_type: int
@@ -91,7 +93,7 @@ async def _listen(url: LinkUrl, seconds: float, enough: Callable[[Received], boo
                 payload[4],
                 payload[5],
                 (0 if before is None else before.heartbeats) + 1,
-                is_signed(frame.raw),
+                is_signed_with_a_key(frame.raw),
                 sources if source is None else sources | {f"{source[0]}:{source[1]}"},
             )
         if enough is not None and enough(received()):

@@ -39,7 +39,7 @@ from companion.ground_station.video import serve_video
 from companion.settings.operator import GroundStationSection
 from companion.vehicle.driver import LinkError
 from companion.vehicle.link_url import parse_link_url
-from companion.vehicle.signing import FrameSigner, read_key
+from companion.vehicle.signing import signer_of
 from vision.home import expanded
 
 
@@ -77,7 +77,7 @@ async def _run(client: ChildClient) -> None:
         parse_link_url(section.url),
         options["system_id"],
         cameras,
-        signer=None if signing_key_file is None else FrameSigner(read_key(signing_key_file)),
+        signer=None if signing_key_file is None else signer_of(signing_key_file),
         say=warn,
         on_standstill=on_standstill,
     )

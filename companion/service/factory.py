@@ -27,7 +27,7 @@ from companion.settings.vehicle import COMPONENT_IDS
 from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.drivers import open_driver
 from companion.vehicle.setpoint import Setpoint
-from companion.vehicle.signing import read_key
+from companion.vehicle.signing import signer_of
 from companion.vehicle.streamer import Streamer
 
 # Beginnings of the lines that its clients print when all is well.
@@ -55,9 +55,9 @@ def driver_of(settings: Settings, on_bytes: OnBytes | None = None) -> Driver:
         own_system_id=settings.vehicle.system_id,
         own_component_id=COMPONENT_IDS[0],
         other_component_ids=COMPONENT_IDS[1:],
-        signing_key=None
+        signer=None
         if settings.vehicle.signing_key_file is None
-        else read_key(settings.vehicle.signing_key_file),
+        else signer_of(settings.vehicle.signing_key_file),
         range_finder_height=settings.guidance.range_finder_height,
         on_bytes=on_bytes,
     )

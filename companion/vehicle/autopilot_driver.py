@@ -36,7 +36,7 @@ from companion.vehicle.driver import (
     SystemStatus,
 )
 from companion.vehicle.flight_commands import FlightCommands
-from companion.vehicle.framing import CURRENT_MODE_ID, Frame, is_signed, pack_frame
+from companion.vehicle.framing import CURRENT_MODE_ID, Frame, pack_frame
 from companion.vehicle.gimbal import Address, GimbalAim, address_text
 from companion.vehicle.gimbal_commands import GimbalCommands
 from companion.vehicle.harmless import are_harmless
@@ -49,7 +49,7 @@ from companion.vehicle.reception import Reception, ReceptionCounts
 from companion.vehicle.report_reader import ReportReader
 from companion.vehicle.setpoint import LEAVES_WITHIN_S, Setpoint, setpoint_fields
 from companion.vehicle.setpoint_echo import NAME as ECHO_NAME
-from companion.vehicle.signing import FrameSigner
+from companion.vehicle.signing import FrameSigner, is_signed_with_a_key
 from companion.vehicle.state import HEARTBEAT_MAX_AGE_S, FlightMode, VehicleState
 from companion.vehicle.stream_requests import StreamRequests
 from companion.vehicle.telemetry import Fields
@@ -108,13 +108,13 @@ class AutopilotDriver(ABC):
         own_system_id: int,
         own_component_id: int,
         other_component_ids: Sequence[int] = (),
-        signing_key: bytes | None = None,
+        signer: FrameSigner | None = None,
         range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> None:
         self.url = url
         self._on_bytes = on_bytes
-        self._signer = None if signing_key is None else FrameSigner(signing_key)
+        self._signer = signer
         self._wanted_system_id = system_id
         self._own_system_id = own_system_id
         self._address = OwnAddress(own_system_id, own_component_id, other_component_ids)
@@ -152,7 +152,8 @@ class AutopilotDriver(ABC):
         self._version_received = asyncio.Event()
         self._others: set[tuple[Any, ...]] = set()
         self._time_sent_ns = 0
-        self._signs = False  # the autopilot's frames are signed
+        self._signs = False  # the autopilot signs with a key of its own
+        self._signs_since_ns = 0
         self._withheld = ""  # the logged reason
         self._only_heartbeats = True
         self.link_count = 0
@@ -375,8 +376,6 @@ class AutopilotDriver(ABC):
                 if frame.component_id == AUTOPILOT_COMPONENT:
                     self._reception.autopilot(frame)
                     self._only_heartbeats &= frame.message_id == HEARTBEAT_ID
-                    # PX4 signs what it sends, and still accepts unsigned messages.
-                    self._signs |= is_signed(frame.raw)
                     if self._streams is not None:
                         self._streams.monitor.received(frame.message_id)
                     if frame.message_id == _TIMESYNC_ID:
@@ -451,6 +450,8 @@ class AutopilotDriver(ABC):
         if self._link is not None:
             self._link.answer_to(source)
         self._newest_heartbeat = frame
+        if self._signs != (signs := is_signed_with_a_key(frame.raw)):
+            self._signs, self._signs_since_ns = signs, time.monotonic_ns()
         fields = {
             "type": mav_type,
             "autopilot": autopilot,
@@ -517,8 +518,15 @@ class AutopilotDriver(ABC):
 
     def _no_answer(self, text: str) -> NoAnswerError:
         """Build the error for a command or parameter request without an answer."""
-        has_key = self._signer is not None
-        advice = no_answer_advice(signs=self._signs, has_key=has_key, only_heartbeats=self._only_heartbeats)
+        answered_ns = self._telemetry.answered_ns
+        advice = no_answer_advice(
+            signs=self._signs,
+            has_key=self._signer is not None,
+            only_heartbeats=self._only_heartbeats,
+            answered_ago_s=(time.monotonic_ns() - answered_ns) / 1e9
+            if answered_ns > self._signs_since_ns
+            else None,
+        )
         return NoAnswerError(f"{text}; {advice}" if advice else text)
 
     def _time_from(self, frame: Frame) -> None:

@@ -10,6 +10,7 @@ from companion.vehicle.signing import FrameSigner
 from companion.vehicle.vehicle_type import ARDUPILOT
 
 _UDP = (LinkScheme.UDP_IN, LinkScheme.UDP_OUT)
+_ANSWERS_S = 3.0  # it is asked for the time twice a second
 _AUTOPILOT_NAMES = {0: "a generic autopilot", 3: "ArduPilot"}
 
 
@@ -50,25 +51,37 @@ def no_autopilot_text(
     return f"no autopilot heartbeat{origin} on {url}{within}: {advice}"
 
 
-def no_answer_advice(*, signs: bool, has_key: bool, only_heartbeats: bool) -> str:
+def no_answer_advice(
+    *, signs: bool, has_key: bool, only_heartbeats: bool, answered_ago_s: float | None
+) -> str:
     """Explain a missing answer of a connected autopilot; empty if nothing hints at the reason.
 
+    An autopilot that requires signatures makes them too, with a key of its own: one that does not is not
+    suspected of it.
+
     Args:
-        signs: its messages are signed. has_key: ours are signed.
+        signs: its messages are signed with a key; PX4's key of zeros is none. has_key: ours are signed.
         only_heartbeats: nothing but heartbeats was received.
+        answered_ago_s: age of the newest time request of ours that it has answered, since it signs as it
+            does; None: it has answered none.
     """
+    if answered_ago_s is not None:
+        if answered_ago_s < _ANSWERS_S:
+            return ""
+        return (
+            f"it still sends, and its newest answer is {answered_ago_s:.0f} s old: check what is between, "
+            "such as a MAVLink router that was restarted or has lost this port, and the wire to the autopilot"
+        )
     if signs and not has_key:
         return (
             "the autopilot signs its messages and may ignore unsigned ones: "
             "set vehicle.signing_key_file to a file with its key"
         )
-    if not only_heartbeats:
-        return ""
-    if has_key:
+    if only_heartbeats:
         return "only heartbeats received from the autopilot: check that it receives on this link"
     return (
-        "only heartbeats received from the autopilot: check that it receives on this link, and whether it "
-        "requires signed messages (vehicle.signing_key_file)"
+        "it sends, and has answered nothing on this link: check that it receives here, and that no MAVLink "
+        "router takes this address for another's: restart the router"
     )
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from companion.vehicle.driver import Driver, OnBytes
 from companion.vehicle.link_url import parse_link_url
+from companion.vehicle.signing import FrameSigner
 
 if TYPE_CHECKING:
     from companion.vehicle.autopilot_driver import AutopilotDriver
@@ -22,7 +23,7 @@ def open_driver(
     own_system_id: int = 1,
     own_component_id: int = 191,
     other_component_ids: Sequence[int] = (),
-    signing_key: bytes | None = None,
+    signer: FrameSigner | None = None,
     range_finder_height: bool = False,
     on_bytes: OnBytes | None = None,
 ) -> Driver:
@@ -36,7 +37,7 @@ def open_driver(
         own_system_id, own_component_id: of our messages; 191 is MAV_COMP_ID_ONBOARD_COMPUTER.
         other_component_ids: used instead where another program has our component id. With any, `connect`
             waits for other programs' heartbeats, for up to 2 s after the link has opened.
-        signing_key: 32 bytes of MAVLink 2 signing; None: nothing is signed and everything is accepted.
+        signer: of MAVLink 2 signing; None: nothing is signed and everything is accepted.
         range_finder_height: as in `VehicleState`.
         on_bytes: called in the loop with everything received and sent.
 
@@ -70,7 +71,7 @@ def open_driver(
         own_system_id=own_system_id,
         own_component_id=own_component_id,
         other_component_ids=other_component_ids,
-        signing_key=signing_key,
+        signer=signer,
         range_finder_height=range_finder_height,
         on_bytes=on_bytes,
     )

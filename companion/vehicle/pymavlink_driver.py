@@ -21,6 +21,7 @@ from companion.vehicle.driver import CommandRefusedError, OnBytes
 from companion.vehicle.framing import EKF_STATUS_REPORT_ID, Frame
 from companion.vehicle.link_url import LinkUrl
 from companion.vehicle.mav_result import IN_PROGRESS
+from companion.vehicle.signing import FrameSigner
 from companion.vehicle.telemetry import TELEMETRY_MESSAGES, Fields
 from companion.vehicle.vehicle_type import ARDUPILOT, PX4
 
@@ -71,7 +72,7 @@ class PymavlinkDriver(AutopilotDriver):
         own_system_id: int,
         own_component_id: int,
         other_component_ids: Sequence[int] = (),
-        signing_key: bytes | None = None,
+        signer: FrameSigner | None = None,
         range_finder_height: bool = False,
         on_bytes: OnBytes | None = None,
     ) -> None:
@@ -81,7 +82,7 @@ class PymavlinkDriver(AutopilotDriver):
             own_system_id=own_system_id,
             own_component_id=own_component_id,
             other_component_ids=other_component_ids,
-            signing_key=signing_key,
+            signer=signer,
             range_finder_height=range_finder_height,
             on_bytes=on_bytes,
         )

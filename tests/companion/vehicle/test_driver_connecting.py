@@ -231,18 +231,18 @@ async def test_udp_out_sends_the_first_heartbeat(kind: DriverKind, port: int) ->
         await vehicle.stop()
 
 
-async def test_no_answer_with_heartbeats_only_names_signing(
+async def test_no_answer_with_heartbeats_only_names_the_link(
     kind: DriverKind, port: int, autopilot: FakeAutopilot
 ) -> None:
     autopilot.answers.clear()
     driver = open_driver(kind, f"udpin://127.0.0.1:{port}")
     try:
         await driver.connect(10.0)
-        with pytest.raises(NoAnswerError, match=r"heartbeats .*key_file"):
+        with pytest.raises(NoAnswerError, match=r"heartbeats .*on this link$"):
             await driver.arm()
         autopilot.send(mavlink.MAVLink_local_position_ned_message(60_000, 0, 0, 0, 0, 0, 0))
         await wait_until(lambda: driver.state.position_ned_m is not None, 5.0)
-        with pytest.raises(NoAnswerError, match=r"command 400 \([^;]*$"):
+        with pytest.raises(NoAnswerError, match=r"command 400 .*router"):
             await driver.arm()
     finally:
         await driver.close()

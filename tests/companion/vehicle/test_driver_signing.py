@@ -150,10 +150,10 @@ async def test_signed_link_works_and_wrong_key_is_reported(
     path.write_bytes(KEY)
     with running_simulator(autopilot=firmware, signing_key=path, ready_after=0.0, speed=4.0) as simulator:
         url = f"udpin://127.0.0.1:{simulator.onboard_port}"
-        other = open_driver("pymavlink", url, signing_key=os.urandom(32))
+        other = open_driver("pymavlink", url, signer=FrameSigner(os.urandom(32)))
         with pytest.raises(LinkError, match=r"signature.*key"):
             await other.connect(2.0)
-        driver = open_driver("pymavlink", url, signing_key=KEY)
+        driver = open_driver("pymavlink", url, signer=FrameSigner(KEY))
         await driver.connect(20.0)
         try:
             await wait_for_state(driver, lambda state: state.ready_to_arm)
@@ -179,7 +179,7 @@ async def test_a_peer_whose_clock_is_late_is_sent_the_time(monkeypatch: pytest.M
     with monkeypatch.context() as clock:
         created_ns = time.monotonic_ns() - 100_000_000_000
         clock.setattr(time, "monotonic_ns", lambda: created_ns)
-        driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}", signing_key=KEY)
+        driver = open_driver("pymavlink", f"udpin://127.0.0.1:{port}", signer=FrameSigner(KEY))
     connecting = asyncio.create_task(driver.connect(20.0))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as autopilot:
         autopilot.setblocking(False)
