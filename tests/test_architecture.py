@@ -94,6 +94,7 @@ OPERATORS_PROGRAMS = (
     "companion.cli.doctor",
     "companion.cli.init",
     "companion.cli.mcp",
+    "companion.cli.signing",
     "companion.cli.ros2",
     "companion.client.drone",
     "companion.ros2.bag",  # of `companion log convert`

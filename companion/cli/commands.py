@@ -32,6 +32,7 @@ from companion.cli.models import models
 from companion.cli.play import play
 from companion.cli.ros2 import ros2
 from companion.cli.run import run
+from companion.cli.signing import signing
 from companion.cli.view import view
 from companion.host.journal import is_journal, redact_last_resort
 from vision.redaction import print_traceback
@@ -66,6 +67,7 @@ for name, group in (
     ("learn", learn),
     ("models", models),
     ("calibrate", calibrate),
+    ("signing", signing),
     ("bench", bench),
     ("ros2", ros2),
 ):

@@ -22,6 +22,7 @@ from companion.doctor import (
 from companion.doctor.check import Check, unknown, worst_first
 from companion.doctor.facts import CameraTrial, CheckKind, Facts, Machine, checks_of
 from companion.doctor.listening import Received, listen
+from companion.doctor.processes import Program
 from companion.doctor.service_query import find_service
 from companion.settings import Settings, SourceSection
 from companion.settings.layers import NO_FILES, SettingsFiles
@@ -146,6 +147,12 @@ def why_not_received(facts: Facts) -> str:
     if held := [*serial_line.possible_holders(path, facts), *serial_line.silent_openers(path, facts)]:
         return f"{held[0]} may have {path} open"
     return ""
+
+
+def link_holders(facts: Facts) -> list[Program]:
+    """Return the programs that have the vehicle's link open: its UDP port or its serial device."""
+    path = serial_line.serial_device(facts)
+    return ports.held_by(facts, "vehicle port") if path is None else serial_line.possible_holders(path, facts)
 
 
 def may_open(source: SourceSection, facts: Facts) -> bool:

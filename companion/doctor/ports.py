@@ -119,6 +119,18 @@ def is_free(facts: Facts, name: str) -> bool:
     )
 
 
+def held_by(facts: Facts, name: str) -> list[Program]:
+    """Return the programs with a socket where a port of this name would be, of other users for root only."""
+    taken = [
+        each.inode
+        for port in _ports(facts)
+        if port.name == name
+        for each in sockets(port.protocol, facts.machine.proc)
+        if port.taken_by(each)
+    ]
+    return holding_sockets(taken, facts.machine.proc)
+
+
 def _check_port(port: _Port, facts: Facts) -> Iterator[Check]:
     proc = facts.machine.proc
     taken = [each for each in sockets(port.protocol, proc) if port.taken_by(each)]

@@ -41,14 +41,24 @@ class Program:
         return f"{self.name} (process {self.pid}{where})"
 
     @property
+    def stopping(self) -> str:
+        """The line that ends it until the next start."""
+        if not self.container and self.unit:
+            return f"{self._systemctl} stop {shlex.quote(self.unit)}"
+        return self.freeing
+
+    @property
+    def _systemctl(self) -> str:
+        return "systemctl --user" if self.user_unit else "sudo systemctl"
+
+    @property
     def freeing(self) -> str:
         """The line that ends it."""
         if self.container:
             return f"docker stop {self.container}"
         if self.unit:
             # A getty is started again at the next boot, and ModemManager by its bus: both need `disable`.
-            own = "--user " if self.user_unit else ""
-            return f"{'' if own else 'sudo '}systemctl {own}disable --now {shlex.quote(self.unit)}"
+            return f"{self._systemctl} disable --now {shlex.quote(self.unit)}"
         return f"kill {self.pid}"
 
 
