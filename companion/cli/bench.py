@@ -1,4 +1,4 @@
-"""The command line of `companion bench detector|latency|setpoints|deadman`."""
+"""The command line of `companion bench detector|latency|setpoints|deadman|chaos`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from companion.cli.flags import AsJson, Command, Device, ImageSize, Model, Threads, plain_errors
+from companion.cli.flags import EXIT_FAILED, AsJson, Command, Device, ImageSize, Model, Threads, plain_errors
 
 bench = typer.Typer(help="Measure performance on this machine.", no_args_is_help=True)
 
@@ -126,6 +126,36 @@ def bench_deadman(
         typer.echo(json.dumps(figures))
     else:
         Console().print(deadman_table(figures))
+
+
+@bench.command("chaos", cls=Command)
+def bench_chaos(
+    minutes: Annotated[float, typer.Option(min=0.1, help="Duration after the warm-up, minutes.")] = 30.0,
+    seed: Annotated[int, typer.Option(help="Of the order of the faults and of the world.")] = 1,
+    period_s: Annotated[float, typer.Option(min=5.0, help="Time between two faults, seconds.")] = 60.0,
+    log: Annotated[Path | None, typer.Option(help="File for what the service prints.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Fly the demonstration with a fault every minute. Prints flights and growth.
+
+    Every flight must land, and the service's processes may not grow: by 5 MB at most, descriptors and threads
+    not at all. Exit code 1 otherwise.
+    """
+    from companion.bench.chaos import lines_of, run_chaos
+    from companion.bus.client import NoAnswerError
+    from companion.bus.session import BusError
+    from companion.simulation.session import SimSessionError
+
+    def say(line: str) -> None:
+        if not as_json:
+            typer.echo(line)
+
+    with plain_errors(SimSessionError, BusError, NoAnswerError, OSError, code=EXIT_FAILED):
+        result = run_chaos(minutes, seed=seed, period_s=period_s, say=say, log_path=log)
+    for line in [json.dumps(result.as_dict())] if as_json else lines_of(result):
+        typer.echo(line)
+    if not result.success:
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _print_figures(figures: dict[str, Any], as_json: bool) -> None:

@@ -75,6 +75,7 @@ class SimOptions:
         autopilot: autopilot firmware to emulate.
         gcs_port: UDP port for a ground station; None: a free one.
         noise: scale of the errors of estimates and sensors; 1: a PX4's.
+        control: zenoh endpoint for faults. signing_key: file of 32 bytes, of a signed link; None: none.
     """
 
     camera: str | None
@@ -88,6 +89,8 @@ class SimOptions:
     autopilot: str = "px4"
     gcs_port: int | None = None
     noise: float = 1.0
+    control: str | None = None
+    signing_key: Path | None = None
 
 
 class SimUnavailableError(SimSessionError, PassingError):
@@ -177,6 +180,10 @@ async def simulator(options: SimOptions) -> AsyncIterator[SimProcess]:
     arguments = ["--onboard-port", str(port), "--onboard-bind", "0"]
     arguments += ["--gcs-port", str(gcs_port), "--gcs-bind", "0", "--autopilot", options.autopilot]
     arguments += ["--noise", f"{options.noise:g}"]
+    if options.control is not None:
+        arguments += ["--control", options.control]
+    if options.signing_key is not None:
+        arguments += ["--signing-key", str(options.signing_key)]
     if options.vehicles > 1:
         arguments += ["--vehicles", str(options.vehicles)]
         if options.camera is not None:

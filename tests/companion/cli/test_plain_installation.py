@@ -116,6 +116,7 @@ WALK: Walk = [
     ("bench latency", ("--driver", "mavsdk", "--seconds", "1"), "service"),
     ("bench setpoints", ("--seconds", "1", "--load", "0"), ENDS),
     ("bench deadman", ("--runs", "0"), ENDS),
+    ("bench chaos", ("--minutes", "0"), ENDS),
     ("signing new", ("signing.key",), ENDS),
     ("signing send", ("--yes", "--vehicle-url", "none"), ENDS),
 ]
