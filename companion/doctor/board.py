@@ -108,10 +108,10 @@ def _clock(facts: Facts) -> Iterator[Check]:
     now = time.strftime("%Y-%m-%d %H:%M", time.gmtime(machine.wall_s))
     if machine.wall_s < machine.built_s - 86400:
         signs = facts.settings.vehicle.signing_key_file is not None
-        yield (fault if signs else warning)(
+        yield warning(
             "clock",
-            f"it is {now} UTC here, before this program was installed: names of recordings, TLS"
-            f"{' and MAVLink signing' if signs else ''} are wrong",
+            f"it is {now} UTC here, before this program was installed: names of recordings and TLS are wrong"
+            f"{'; MAVLink signing goes on from its kept timestamp' if signs else ''}",
             "sudo timedatectl set-ntp true with a network, a clock with a battery, or fake-hwclock",
         )
         return
@@ -123,11 +123,7 @@ def _clock(facts: Facts) -> Iterator[Check]:
         if kept
         else "not synchronised"
     )
-    if kept is False and facts.settings.vehicle.signing_key_file is not None:
-        found = f"{now} UTC, {state}: a signed link refuses frames that are older than those before"
-        yield warning("clock", found, "sudo timedatectl set-ntp true")
-    else:
-        yield ok("clock", f"{now} UTC, {state}")
+    yield ok("clock", f"{now} UTC, {state}")
 
 
 def _scheduling(facts: Facts) -> Iterator[Check]:
@@ -189,7 +185,7 @@ def _number(path: Path) -> float | None:
 CHECKS = (
     CheckKind("supply", "undervoltage and throttling of a Raspberry Pi, over-current of a Jetson", _supply),
     CheckKind("temperature", "a board near its limit", _temperature),
-    CheckKind("clock", "a clock before the installation, or not synchronised on a signed link", _clock),
+    CheckKind("clock", "a clock before the installation", _clock),
     CheckKind(
         "scheduling", "a busy computer; the kernel, and whether a real-time policy is permitted", _scheduling
     ),
