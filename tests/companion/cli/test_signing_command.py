@@ -1,4 +1,4 @@
-"""`companion signing new` and the refusals of `send`."""
+"""`companion signing new` and the errors of `send`."""
 
 from __future__ import annotations
 
