@@ -170,8 +170,8 @@ def test_stuck_console_delays_neither_setpoints_nor_another_console(tmp_path: Pa
             longest_s = max(longest_s, time.monotonic() - now_s)
         took_s, after = time.monotonic() - began_s, status_of(service)
         sent = after["pilot"]["setpoints_sent"] - before["pilot"]["setpoints_sent"]
-        assert sent / took_s > 25.0  # of 50 a second; PX4 leaves OFFBOARD below 2
-        assert longest_s < 3.0  # a send that blocks takes 5 s
+        assert sent / took_s > 10.0  # of 50 a second; a send that blocks for 5 s ends OFFBOARD
+        assert longest_s < 3.0
         assert after["vehicle"]["mode"] == "offboard"
         os.kill(stuck.process.pid, signal.SIGCONT)
         stuck.until_row("goto 50 0 3: failed")

@@ -69,6 +69,7 @@ WALK: Walk = [
     ("detect", ("demo.png", "--runtime", "tensorrt"), "models"),
     ("detect", ("demo.png", "--runtime", "auto", "--image-size", "320"), ENDS),
     ("send", ("land", *NOBODY), ENDS),
+    ("console", NOBODY, ENDS),
     ("echo", ("detections", *NOBODY), ENDS),
     ("init", (), ENDS),
     ("status", NOBODY, ENDS),
