@@ -93,6 +93,7 @@ OPERATORS_PROGRAMS = (
     "companion.cli.console",
     "companion.cli.doctor",
     "companion.cli.init",
+    "companion.cli.install",
     "companion.cli.mcp",
     "companion.cli.signing",
     "companion.cli.ros2",

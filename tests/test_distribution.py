@@ -43,13 +43,18 @@ def test_wheel_holds_the_packages_and_their_data(tmp_path: Path) -> None:
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("vision/weights/default.*")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/dashboard/page/*")}
     wanted |= {path.relative_to(ROOT).as_posix() for path in ROOT.glob("companion/guidance/policies/*.onnx")}
+    wanted |= {f"companion/setup/systemd/{path.name}" for path in ROOT.glob("systemd/*")}
     wanted |= {f"{package}/py.typed" for package in packages}
     assert wanted <= set(names), sorted(wanted - set(names))
-    for unit in ("companion.service", "companion@.service", "companion.toml"):
-        assert any(name.endswith(f"share/mavlink-companion/systemd/{unit}") for name in names)
 
 
 def test_source_distribution_holds_what_a_build_needs(tmp_path: Path) -> None:
     with tarfile.open(build(tmp_path, "build_sdist")) as archive:
         names = {name.partition("/")[2] for name in archive.getnames()}
-    assert {"pyproject.toml", "README.md", "LICENSE", "NOTICE", "systemd/companion.service"} <= names
+    assert {
+        "pyproject.toml",
+        "README.md",
+        "LICENSE",
+        "NOTICE",
+        "companion/setup/systemd/companion.service",
+    } <= names

@@ -11,6 +11,7 @@ import pytest
 
 from companion.cli.flags import EXIT_BAD_INPUT
 from companion.settings.layers import SYSTEM_FILE
+from companion.setup.files import CURRENT
 from vision.model_files import SYSTEM_FOLDER
 
 ROOT = Path(__file__).parent.parent
@@ -19,7 +20,7 @@ TEMPLATE = ROOT / "systemd" / "companion@.service"
 # What an instance has of its own: the unit's text and the template's.
 OWN = {
     "Description": ("zenoh", "zenoh (%i)"),
-    "ExecStart": ("/etc/companion/companion.toml", "/etc/companion/%i.toml"),
+    "ExecStart": ("companion run", "companion run --config /etc/companion/%i.toml"),
     "StateDirectory": ("companion companion/models", "companion/%i companion/models"),
     "Environment": ("/var/cache/companion", "/var/cache/companion COMPANION_VEHICLE_NAME=%i"),
     "WorkingDirectory": ("/var/lib/companion", "/var/lib/companion/%i"),
@@ -69,7 +70,11 @@ def test_unit_has_the_folders_of_the_program() -> None:
     found = settings(UNIT)
     folders = {Path("/var/lib") / name for name in found["StateDirectory"][0].split()}
     assert SYSTEM_FOLDER in folders
-    assert str(SYSTEM_FILE) in found["ExecStart"][0]
+    # Without --config: a computer without settings starts with the defaults, the unit's user has none.
+    assert found["ExecStart"] == [f"{CURRENT}/bin/companion run"]
+    assert settings(TEMPLATE)["ExecStart"] == [
+        f"{CURRENT}/bin/companion run --config {SYSTEM_FILE.with_name('%i.toml')}"
+    ]
     assert "COMPANION_MODELS_FOLDER" not in UNIT.read_text()
 
 

@@ -24,6 +24,7 @@ from companion.cli.detect import DETECT_SETTINGS, detect
 from companion.cli.doctor import doctor, status
 from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, Command, CompanionCommands, settings_command
 from companion.cli.init import init
+from companion.cli.install import install, uninstall
 from companion.cli.learn import learn
 from companion.cli.log import log
 from companion.cli.markers import MARKER_SETTINGS, markers
@@ -58,6 +59,8 @@ settings_command(app, *CLIENT_SETTINGS)(echo)
 app.command(cls=Command)(init)
 settings_command(app, *CLIENT_SETTINGS)(status)
 settings_command(app)(doctor)
+app.command(cls=Command)(install)
+app.command(cls=Command)(uninstall)
 settings_command(app, *ASK_SETTINGS)(ask)
 settings_command(app, *MCP_SETTINGS)(mcp)
 settings_command(app)(describe)

@@ -1,4 +1,4 @@
-"""Sets up a computer for the service: finds autopilot, cameras and the fastest runtime, and writes settings.
+"""Sets up a computer: finds what settings need and writes them, and installs the service of systemd.
 
 Nothing is sent to an autopilot, and nothing is opened that another program has open.
 """

@@ -74,6 +74,8 @@ WALK: Walk = [
     ("init", (), ENDS),
     ("status", NOBODY, ENDS),
     ("doctor", (*NOBODY, "--vehicle-url", "none", "--source", "none"), ENDS),
+    ("install", ("--user", "--dry-run"), ENDS),
+    ("uninstall", ("--user", "--dry-run"), ENDS),
     ("ask", ("land", *NOBODY), ENDS),
     ("ask", ("land", *NOBODY, "--language-model", "small"), "language"),
     ("mcp", NOBODY, "language"),

@@ -1,0 +1,76 @@
+"""Asks and commands systemd, by its programs."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from companion.setup.files import SYSTEM_UNITS, UNIT, below
+
+_INSTANCES = "companion@*.service"
+_LONGEST_S = 90.0  # of a stop: TimeoutStopSec of the unit, and a margin
+
+
+class SetupError(Exception):
+    """The computer was not set up. The message has one line each: what, and what to do."""
+
+
+def run_program(command: Sequence[str]) -> str:
+    """Run a program and return what it prints. Raises SetupError with its last line."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
+    except FileNotFoundError as error:
+        raise SetupError(f"{command[0]}: no such program; this needs a Linux with systemd") from error
+    except subprocess.TimeoutExpired as error:
+        raise SetupError(f"{' '.join(command)}: no end yet, given up") from error
+    if done.returncode:
+        said = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
+        raise SetupError(f"{' '.join(command)}: {said[-1]}")
+    return done.stdout
+
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """The computer that is set up. A test has a folder, and notes what is run.
+
+    Attributes:
+        user: the service is of this user's manager, not of the system.
+        root: a folder in place of `/`. run: runs a program and returns what it prints, or raises SetupError.
+    """
+
+    user: bool = False
+    root: Path = Path("/")
+    run: Callable[[Sequence[str]], str] = run_program
+
+    def systemctl(self, *words: str) -> tuple[str, ...]:
+        """Return a command of systemctl."""
+        return ("systemctl", *(("--user",) if self.user else ()), *words)
+
+    def journal(self, unit: str, since_s: float, lines: int) -> str:
+        """Return the newest lines of a unit since a time of day, seconds since 1970."""
+        of_unit = "--user-unit" if self.user else "--unit"
+        options = (f"--since=@{since_s:.0f}", f"--lines={lines}", "--no-pager", "--output=cat")
+        return self.run(("journalctl", of_unit, unit, *options))
+
+    def show(self, unit: str) -> Mapping[str, str]:
+        """Return the state of a unit, as `systemctl show` names it; of one that is not there too."""
+        names = ("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID")
+        printed = self.run(self.systemctl("show", unit, f"--property={','.join((*names, 'ExecMainStatus'))}"))
+        return dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
+
+    def instances(self) -> list[str]:
+        """Return the instances of the template that are loaded or enabled, sorted."""
+        words = self.systemctl("list-units", "--all", "--plain", "--no-legend", _INSTANCES)
+        found = {line.split()[0] for line in self.run(words).splitlines() if line.strip()}
+        wants = below(self.root, SYSTEM_UNITS) / "multi-user.target.wants"
+        return sorted(found | {path.name for path in wants.glob(_INSTANCES)})
+
+    def units(self) -> list[str]:
+        """Return the service's unit, and its instances."""
+        return [UNIT, *(() if self.user else self.instances())]
+
+    def is_active(self, unit: str) -> bool:
+        """Whether a unit runs, and is ready."""
+        return self.show(unit).get("ActiveState") in ("active", "reloading", "deactivating")

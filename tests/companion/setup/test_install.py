@@ -1,0 +1,300 @@
+"""`companion install` and `uninstall` in a folder in place of `/`: files, commands, and what they refuse."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from companion.doctor.service_query import Found
+from companion.setup import flight, install, uninstall
+from companion.setup.files import (
+    CURRENT,
+    INSTALLATIONS,
+    RULES,
+    SYSTEM_UNITS,
+    TEMPLATE,
+    UNIT,
+    packaged,
+    system_entries,
+    user_unit,
+)
+from companion.setup.systemctl import Host, SetupError
+from tests.companion.doctor.computer import service
+
+OLD, NEW = INSTALLATIONS / "1.0", INSTALLATIONS / "1.1"
+SETTINGS = '[vehicle]\nurl = "serial:///dev/ttyTHS1:921600"\n'
+
+
+class Computer:
+    """A computer in a folder. `commands`: what was run. `said`: what was printed."""
+
+    def __init__(self, root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.root, self._patch = root, monkeypatch
+        self.commands: list[tuple[str, ...]] = []
+        self.said: list[str] = []
+        self.states: dict[str, str] = {}
+        self.host = Host(root=root, run=self._run)
+        for folder in ("run/systemd/system", "run/udev", "opt/companion", "dev", "etc/companion"):
+            (root / folder).mkdir(parents=True)
+        for name in ("run/udev/control", "dev/ttyTHS1"):
+            (root / name).touch()
+        self.settings = root / "etc/companion/companion.toml"
+        self.settings.write_text(SETTINGS)
+        monkeypatch.setattr("os.geteuid", lambda: 0)
+        monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+        monkeypatch.setattr(install, "wait_until_up", lambda *_: True)
+        monkeypatch.setattr(uninstall, "_has_user", lambda: True)
+        self.version(OLD)
+
+    def version(self, environment: Path) -> None:
+        """Be called from an environment."""
+        self._patch.setattr(sys, "prefix", str(environment))
+
+    def _run(self, command: Sequence[str]) -> str:
+        words = tuple(command)
+        if words[1] == "show":
+            return self.states.get(words[2], "ActiveState=inactive")
+        if words[1] != "list-units":
+            self.commands.append(words)
+        return ""
+
+    def install(self, **options: bool) -> None:
+        install.install(self.host, self.said.append, **options)
+
+    def uninstall(self, **options: bool) -> None:
+        uninstall.uninstall(self.host, self.said.append, **options)
+
+    def ran(self, *words: str) -> bool:
+        return words in self.commands
+
+    def files(self) -> dict[str, str]:
+        return {
+            str(path): str(path.readlink()) if path.is_symlink() else path.read_text()
+            for path in sorted(self.root.rglob("*"))
+            if path.is_symlink() or path.is_file()
+        }
+
+
+@pytest.fixture
+def computer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Computer:
+    return Computer(tmp_path, monkeypatch)
+
+
+def test_install_writes_its_files_and_starts(computer: Computer) -> None:
+    computer.install()
+    assert all(entry.is_there() for entry in system_entries(OLD, computer.root))
+    assert (computer.root / "opt/companion/current").readlink() == OLD
+    assert computer.settings.read_text() == SETTINGS
+    names = [" ".join(words[:2]) for words in computer.commands]
+    assert names[0].startswith("systemd-sysusers ")
+    assert names[1] == "systemd-tmpfiles --create"
+    assert names[2:] == [
+        *("udevadm control", "udevadm trigger", "systemctl daemon-reload", "systemctl enable"),
+        "systemctl --no-block",
+    ]
+    assert computer.ran("systemctl", "--no-block", "restart", UNIT)
+
+
+def test_second_install_writes_and_restarts_nothing(computer: Computer) -> None:
+    computer.install()
+    before = computer.files()
+    computer.commands.clear()
+    computer.install()
+    assert computer.files() == before
+    assert computer.ran("systemctl", "--no-block", "start", UNIT)
+    assert not any("restart" in words for words in computer.commands)
+
+
+def test_dry_run_prints_and_changes_nothing(computer: Computer) -> None:
+    before = computer.files()
+    computer.install(dry_run=True)
+    assert (computer.files(), computer.commands) == (before, [])
+    printed = "\n".join(computer.said)
+    for name in (UNIT, TEMPLATE, "sysusers.conf", "tmpfiles.conf", "70-companion.rules"):
+        assert all(line in printed for line in packaged(name).splitlines())
+    assert f"+{OLD}" in printed
+    assert "systemctl daemon-reload" in printed
+
+
+def test_dry_run_shows_what_changes_in_a_file(computer: Computer) -> None:
+    computer.install()
+    unit = computer.root / SYSTEM_UNITS.relative_to("/") / UNIT
+    unit.write_text(unit.read_text().replace("WatchdogSec=5", "WatchdogSec=50"))
+    computer.said.clear()
+    computer.install(dry_run=True)
+    lines = [line.strip() for line in computer.said]
+    assert {"-WatchdogSec=50", "+WatchdogSec=5"} <= set(lines)
+    assert "WatchdogSec=50" in unit.read_text()
+
+
+def test_update_and_rollback_move_the_link_and_restart(computer: Computer) -> None:
+    computer.install()
+    for version in (NEW, OLD):
+        computer.commands.clear()
+        computer.version(version)
+        computer.install()
+        assert (computer.root / CURRENT.relative_to("/")).readlink() == version
+        assert computer.ran("systemctl", "--no-block", "restart", UNIT)
+
+
+@pytest.mark.parametrize(
+    ("armed", "force", "installed"), [(True, False, False), (True, True, True), (False, False, True)]
+)
+def test_armed_vehicle_is_not_left(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, armed: bool, force: bool, installed: bool
+) -> None:
+    found = Found(service({"vehicle.armed": armed}))
+    monkeypatch.setattr(flight, "find_service", lambda *_: found)
+    computer.states[UNIT] = "ActiveState=active"
+    for act in (computer.install, computer.uninstall):
+        if installed:
+            act(force=force)
+        else:
+            with pytest.raises(SetupError, match="--force"):
+                act(force=force)
+            assert not computer.commands
+
+
+def test_silent_service_is_not_taken_for_disarmed(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(flight, "find_service", lambda *_: Found())
+    computer.states[UNIT] = "ActiveState=active"
+    with pytest.raises(SetupError, match="--force"):
+        computer.install()
+
+
+@pytest.mark.parametrize(
+    ("prefix", "python"),
+    [
+        ("/home/pi/venv", "/usr/bin/python3.11"),
+        (str(INSTALLATIONS), "/usr/bin/python3.11"),
+        (str(CURRENT), "/usr/bin/python3.11"),
+        (str(OLD), "/root/.pyenv/versions/3.11/bin/python3.11"),
+    ],
+)
+def test_environment_that_the_service_cannot_use_is_named(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, prefix: str, python: str
+) -> None:
+    before = computer.files()
+    monkeypatch.setattr(sys, "prefix", prefix)
+    monkeypatch.setattr(sys, "executable", python)
+    with pytest.raises(SetupError) as raised:
+        computer.install()
+    assert "companion install --user" in str(raised.value)
+    assert f"python3 -m venv {INSTALLATIONS}/" in str(raised.value)
+    assert computer.files() == before
+
+
+@pytest.mark.parametrize("missing", ["root", "systemd"])
+def test_install_needs_root_and_systemd(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, missing: str
+) -> None:
+    if missing == "root":
+        monkeypatch.setattr("os.geteuid", lambda: 1000)
+    else:
+        (computer.root / "run/systemd/system").rmdir()
+    with pytest.raises(SetupError, match=missing):
+        computer.install()
+    assert not computer.commands
+
+
+def test_login_terminals_of_the_serial_line_are_disabled(computer: Computer) -> None:
+    computer.states["serial-getty@ttyTHS1.service"] = "ActiveState=active"
+    computer.states["nvgetty.service"] = "ActiveState=inactive\nUnitFileState=enabled"
+    computer.states["serial-getty@ttyS0.service"] = "ActiveState=active"
+    computer.install()
+    disabled = [words[-1] for words in computer.commands if words[1] == "disable"]
+    assert disabled == ["serial-getty@ttyTHS1.service", "nvgetty.service"]
+
+
+def test_no_login_terminal_is_disabled_for_a_network_link(computer: Computer) -> None:
+    computer.settings.write_text('[vehicle]\nurl = "udpin://127.0.0.1:14540"\n')
+    computer.states["serial-getty@ttyTHS1.service"] = "ActiveState=active"
+    computer.install()
+    assert not any(words[1] == "disable" for words in computer.commands)
+
+
+def test_wrong_settings_do_not_stop_the_installation(computer: Computer) -> None:
+    computer.settings.write_text("[vehicle]\nurl = 5\n")
+    computer.install()
+    assert any("vehicle.url" in line for line in computer.said)
+    assert computer.ran("systemctl", "enable", UNIT)
+
+
+def test_uninstall_removes_what_install_wrote(computer: Computer) -> None:
+    before = computer.files()
+    computer.install()
+    (computer.root / "opt/companion/1.0").mkdir()
+    computer.commands.clear()
+    computer.uninstall()
+    assert computer.files() == before
+    assert computer.ran("systemctl", "disable", "--now", UNIT)
+    assert not computer.ran("userdel", "companion")
+    kept = [line for line in computer.said if line.startswith("kept")]
+    assert any("/etc/companion" in line and "--purge" in line for line in kept)
+    assert any("sudo rm -r" in line and line.endswith("companion/1.0") for line in kept)
+
+
+def test_purge_removes_settings_recordings_and_user(computer: Computer) -> None:
+    computer.install()
+    for folder in ("var/lib/companion/flights", "var/cache/companion"):
+        (computer.root / folder).mkdir(parents=True)
+    computer.uninstall(purge=True)
+    for folder in ("etc/companion", "var/lib/companion", "var/cache/companion"):
+        assert not (computer.root / folder).exists()
+    assert computer.ran("userdel", "companion")
+
+
+def test_uninstall_names_what_it_does_not_change_back(computer: Computer) -> None:
+    computer.install()
+    computer.states["nvgetty.service"] = "UnitFileState=disabled"
+    drop_in = computer.root / "etc/systemd/system/companion.service.d"
+    drop_in.mkdir()
+    computer.uninstall()
+    kept = [line for line in computer.said if line.startswith("kept")]
+    assert any("systemctl enable --now nvgetty.service" in line for line in kept)
+    assert any(str(drop_in) in line for line in kept)
+
+
+def test_uninstall_without_an_installation_changes_nothing(computer: Computer) -> None:
+    before = computer.files()
+    computer.uninstall()
+    assert computer.files() == before
+    assert computer.commands == [("systemctl", "daemon-reload")]
+
+
+def test_unit_of_a_user_asks_for_no_privileges() -> None:
+    lines = user_unit(Path("/home/a b/100%/bin/python")).splitlines()
+    keys = [line.partition("=")[0] for line in lines if re.match(r"\w+=", line)]
+    system = packaged(UNIT).splitlines()
+    for line in system:
+        if re.match(r"(Watchdog|Restart|Timeout|Kill|Type|UMask|NoNew)\w*=", line):
+            assert line in lines
+    assert not {"User", "SupplementaryGroups", "Nice", "CapabilityBoundingSet", "StateDirectory"} & set(keys)
+    assert 'ExecStart="/home/a b/100%%/bin/python" -m companion.cli run' in lines
+    assert "WantedBy=default.target" in lines
+    assert "WantedBy=multi-user.target" not in lines
+
+
+@pytest.mark.needs("systemd-analyze")
+def test_unit_of_a_user_is_valid(tmp_path: Path) -> None:
+    unit = tmp_path / UNIT
+    unit.write_text(user_unit(Path(sys.executable)))
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--user", unit], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert UNIT not in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize("vendor", ["26ac", "3185", "3643", "3162", "3163", "2dae", "1209", "0483"])
+def test_rule_names_the_vendors_of_flight_controllers(vendor: str) -> None:
+    rules = [line for line in packaged(RULES.name).splitlines() if not line.startswith("#")]
+    assert any(vendor in line and 'ENV{ID_MM_DEVICE_IGNORE}="1"' in line for line in rules)
+    # Never for a device of any vendor.
+    assert all("idVendor" in line for line in rules if "ID_MM_DEVICE_IGNORE" in line)
