@@ -35,7 +35,7 @@ for try in 1 2 3; do if timeout 600 sh -ec '$(2)'; then exit 0; fi; sleep $$((5 
 	echo "make programs: could not install $(1); the lines above say why" >&2; exit 1
 endef
 
-.PHONY: demo test test-slow programs debian lint format clean
+.PHONY: demo test test-slow test-systemd programs debian lint format clean
 
 demo: $(READY)
 	$(BIN)/companion demo --output demo-output
@@ -53,6 +53,11 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "slow and not realtime"
 	$(BIN)/python -m pytest $(REALTIME) -n $(REALTIME_WORKERS) --dist worksteal -m "slow and realtime" --reruns 1
 	$(BIN)/python -m pytest --ignore tests/alone -n $(WORKERS) -m "hypothesis and not slow" --hypothesis-profile explore --reruns 1
+
+# As root; the first time some minutes, for Debian's files and the packages, which are kept.
+test-systemd: export COMPANION_TEST_SYSTEMD ?= $(or $(XDG_CACHE_HOME),$(HOME)/.cache)/mavlink-companion/test-systemd
+test-systemd: $(READY)
+	$(BIN)/python -m pytest tests/systemd -m systemd
 
 programs: debian $(AXE) $(MAVPROXY) $(ROS_READER) .venv-ros-jazzy/.installed .venv-ros-kilted/.installed $(PYZEROS)
 

@@ -51,6 +51,10 @@ GSTREAMER_FILES = (
     "lib/*/gstreamer-1.0/libgstrtp.so",
     "lib/*/gstreamer-1.0/libgstopenh264.so",
 )
+# A folder for what `make test-systemd` keeps between two runs.
+SYSTEMD = Path(folder) if (folder := os.environ.get("COMPANION_TEST_SYSTEMD")) else None
+# To make and boot a container of Debian, as root.
+CONTAINER = ("debootstrap", "systemd-nspawn", "nsenter", "apt-get")
 COMPILER = (sysconfig.get_config_var("CC") or "cc").split()[0]
 
 MAKE = "`make programs`, on Debian as root"
@@ -111,6 +115,11 @@ NEEDS = {
     ),
     "mavlink-router": Need(
         shutil.which("mavlink-routerd") is not None, "a real MAVLink router", "docs/boards.md"
+    ),
+    "systemd container": Need(
+        SYSTEMD is not None and os.geteuid() == 0 and all(map(shutil.which, CONTAINER)),
+        "install, watchdog, stop and update under systemd",
+        "`make test-systemd`, as root, with debootstrap and systemd-container of Debian",
     ),
     "autopilot": Need("COMPANION_SITL_URL" in os.environ, "SITL", "docs/how-to/sitl.md"),
     "test data": Need(DATA.is_dir(), "real flights, photographs and networks", "COMPANION_TEST_DATA"),
