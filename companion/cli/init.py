@@ -36,7 +36,7 @@ def init(
         typer.Option("--serial", metavar="DEVICE", help="Look at this serial device too; may be repeated."),
     ] = None,
 ) -> None:
-    """Find autopilot, cameras and the fastest runtime, and write the settings.
+    """Find autopilot, cameras, runtime, and write the settings.
 
     Only what differs from the defaults is written. It listens, and sends nothing to the autopilot; what
     another program has open is left alone. A file that is there is kept under a name with the time.

@@ -9,6 +9,8 @@ import os
 # recording of guidance has them without it.
 SLOWNESS = (
     "guidance loop paused for",
+    "stood still for",
+    "this computer is too slow",
     "setpoint expired",
     "setpoint stream interrupted",
     "no fresh setpoint",

@@ -28,6 +28,7 @@ OTHERS = (
     "no answer within {} s; `companion echo status`",
     "no answer from vehicle",
     "no answer within",
+    "no answer of the service within",
     "no settings of vehicle",
     "no status for",
     "no connection within",
