@@ -82,7 +82,8 @@ def init(
             "companion: no autopilot found: see above, mend it, and run companion init again", err=True
         )
         raise typer.Exit(EXIT_FAILED)
-    typer.echo("next: companion doctor; companion run")
+    user = "" if os.geteuid() == 0 else " --user"
+    typer.echo(f"next: companion doctor; companion run, or companion install{user}")
 
 
 def _finish(target: Target, text: str, *, yes: bool, dry_run: bool) -> None:
