@@ -92,6 +92,7 @@ def test_the_clock_of_a_process_follows_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.realtime
+@pytest.mark.timeout(600)
 def test_a_short_soak_lands_every_flight() -> None:
     lines: list[str] = []
     result = run_chaos(1.0, seed=3, period_s=10.0, say=lines.append)
