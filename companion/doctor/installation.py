@@ -14,6 +14,7 @@ from vision.sources.camera import camera_device
 
 PACKAGE = "mavlink-companion"
 # `name>=1.2`, with what follows; extras' names in brackets before it.
+_OF_DEVELOPERS = re.compile(r"extra == ['\"]dev['\"]")
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)(?:\[[^]]*\])?\s*>=\s*(?P<least>[0-9.]+)(?P<rest>.*)")
 
 
@@ -80,7 +81,7 @@ def check_packages(lines: Iterable[str], version_of: Callable[[str], str | None]
     old = False
     for line in lines:
         match = _REQUIREMENT.match(line)
-        if match is None:
+        if match is None or _OF_DEVELOPERS.search(match["rest"]):  # an environment has setuptools without it
             continue
         name, least, of_extra = match["name"], match["least"], "extra ==" in match["rest"]
         there = version_of(name)

@@ -370,6 +370,7 @@ def test_node_without_images_is_a_fault(computer: Computer, monkeypatch: pytest.
         ("torch>=2.10; extra == 'models'", "2.10.0+cpu", Verdict.OK),
         ("torch>=2.10; extra == 'models'", None, Verdict.OK),
         ("mavlink-companion[models]; extra == 'all'", None, Verdict.OK),
+        ('setuptools>=77; extra == "dev"', "66.1.1", Verdict.OK),
     ],
 )
 def test_package_below_its_lower_bound_is_found(line: str, there: str | None, verdict: Verdict) -> None:
