@@ -32,6 +32,8 @@ _LIMITS, _USUAL_LIMIT_C = ("hot", "critical"), 95.0
 _NEAR_C = 5.0
 _MB = 1_000_000
 _LEAST_FREE_MB = 500
+# eMMC, JEDEC JESD84-B51: life in tenths, one more is beyond; of its reserved blocks 80 %, then 90 % are used.
+_LIFE_TENTHS, _WORN_TENTHS, _RESERVE_LOW, _URGENT = 10, 9, 2, 3
 _TIME_ERROR = 5  # of adjtimex(2): the clock is not synchronised
 _TIMEX_BYTES = 512  # more than struct timex has
 
@@ -168,6 +170,40 @@ def _space(name: str, folder: Path, planned_mb: int | None) -> Check:
     return ok(name, text)
 
 
+def _wear(facts: Facts) -> Iterator[Check]:
+    """Of the disks with the journal and the recordings, what eMMC reports: the kernel's mmc-dev-attrs."""
+    directory = facts.settings.recording.directory
+    folders = [facts.machine.log, *([expanded(directory).absolute()] if directory else [])]
+    devices: dict[Path, None] = {}
+    for folder in folders:
+        there = next(path for path in (folder, *folder.parents) if path.exists())
+        number = there.stat().st_dev
+        node = (facts.machine.sys / "dev/block" / f"{os.major(number)}:{os.minor(number)}").resolve()
+        devices |= dict.fromkeys(disk for disk in (node, node.parent) if (disk / "device" / "type").exists())
+    for disk in devices:
+        kind = _text(disk / "device" / "type")
+        if kind == "SD":
+            yield ok("disk wear", f"{disk.name} is an SD card, which reports none: recordings wear it")
+        elif kind == "MMC":
+            yield _worn(disk)
+
+
+def _worn(disk: Path) -> Check:
+    words = [*_text(disk / "device" / "life_time").split(), _text(disk / "device" / "pre_eol_info")]
+    try:
+        *lives, reserve = (int(word, 16) for word in words)
+    except ValueError:
+        return unknown("disk wear", f"{disk.name} does not report it")
+    tenths = max(lives, default=0)
+    text = f"{disk.name} has used {(tenths - 1) * 10} to {tenths * 10} % of its life" if tenths else disk.name
+    advice = "replace it; until then recording.directory on another disk, and a smaller journal"
+    if tenths > _LIFE_TENTHS or reserve >= _URGENT:
+        return fault("disk wear", f"{disk.name} is at the end of its life", advice)
+    if tenths >= _WORN_TENTHS or reserve == _RESERVE_LOW:
+        return warning("disk wear", text, advice)
+    return ok("disk wear", text)
+
+
 def _text(path: Path) -> str:
     try:
         return path.read_text(errors="replace").strip("\0 \n")
@@ -190,4 +226,5 @@ CHECKS = (
         "scheduling", "a busy computer; the kernel, and whether a real-time policy is permitted", _scheduling
     ),
     CheckKind("disk", "little space for the journal, or less than `recording.max_total_mb`", _disk),
+    CheckKind("disk wear", "eMMC that is near the end of its life", _wear),
 )

@@ -349,6 +349,33 @@ def test_full_disk_is_a_fault(computer: Computer, monkeypatch: pytest.MonkeyPatc
     assert found(computer.checks(), "disk", FAULT)
 
 
+@pytest.mark.parametrize(
+    ("kind", "life", "reserve", "verdict"),
+    [
+        ("MMC", "0x01 0x02", "0x01", Verdict.OK),
+        ("MMC", "0x01 0x09", "0x01", WARNING),
+        ("MMC", "0x01 0x01", "0x02", WARNING),
+        ("MMC", "0x0b 0x01", "0x01", FAULT),
+        ("MMC", "0x01 0x01", "0x03", FAULT),
+        ("MMC", "", "", UNKNOWN),
+        ("SD", "", "", Verdict.OK),
+    ],
+)
+def test_worn_disk_of_journal_and_recordings_is_found(
+    kind: str, life: str, reserve: str, verdict: Verdict, computer: Computer
+) -> None:
+    number = computer.root.stat().st_dev
+    disk = "sys/devices/mmc_host/mmc0/block/mmcblk0"
+    for name, text in {"type": kind, "life_time": life, "pre_eol_info": reserve}.items():
+        computer.write(f"{disk}/device/{name}", text)
+    computer.write(f"{disk}/mmcblk0p2/partition", "2")
+    link = computer.root / "sys/dev/block" / f"{os.major(number)}:{os.minor(number)}"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(computer.root / disk / "mmcblk0p2")
+    (check,) = found(computer.checks({"recording": {"directory": str(computer.root)}}), "disk wear", verdict)
+    assert "mmcblk0" in check.found
+
+
 def test_busy_computer_is_a_warning(computer: Computer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(board, "busy_text", lambda: "; the computer is busy")
     assert found(computer.checks(), "scheduling", WARNING)
