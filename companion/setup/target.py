@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 
 from companion.settings import Settings
 from companion.settings.layers import SettingsFiles, system_file, user_file
-from companion.settings.reading import load_layers, load_settings
+from companion.settings.reading import ConfigurationError, load_layers, load_settings
 from companion.settings.toml_text import parse_toml
 from companion.setup.settings_file import Change, value_in
 from vision.text_file import read_text
@@ -60,16 +61,30 @@ def read_target(path: Path) -> Target:
     Raises:
         ConfigurationError: it has mistakes, or cannot be read.
     """
+    is_there = _is_file(path)
     files: tuple[Path, ...] = ()
     system = system_file()
     if path.resolve() == user_file().resolve() and system.exists():
         files = (system,)
     below = load_layers(SettingsFiles(files), environment={}).settings
-    if not path.exists():
+    if not is_there:
         return Target(path, "", {}, below, below)
     settings = load_layers(SettingsFiles((*files, path)), environment={}).settings
     text = read_text(path)
     return Target(path, text, parse_toml(text), settings, below)
+
+
+def _is_file(path: Path) -> bool:
+    """Whether there is a file. Raises ConfigurationError: something else, which must not be replaced."""
+    try:
+        kind = stat.S_IFMT(path.stat().st_mode)
+    except FileNotFoundError:
+        return False
+    except OSError as error:
+        raise ConfigurationError(f"cannot read the settings file {path}: {error.strerror}") from error
+    if kind != stat.S_IFREG:
+        raise ConfigurationError(f"{path} is no file that can hold settings; give another --output")
+    return True
 
 
 def check_text(path: Path, text: str) -> None:

@@ -89,6 +89,9 @@ READERS: dict[str, tuple[tuple[str, str], ...]] = {
     "log convert file": (("log convert {} out.mcap", ".mcap"), ("log convert {} out.tlog", ".mcap")),
     "config": (("describe settings --config {}", ".toml"),),
     "vehicle.signing_key_file": (("describe settings --check --vehicle-signing-key-file {}", ".key"),),
+    "signing send key_file": (("signing send --yes --key-file {}", ".key"),),
+    "signing send present_key_file": (("signing send --yes --off --present-key-file {}", ".key"),),
+    "init output": (("init --yes --dry-run --output {}", ".toml"),),
     "source.depth": (("detect frame.png --model none --depth --source-depth {}", ".npy"),),
     "source.depth_calibration_file": (
         ("describe settings --source-depth frame.png --source-depth-calibration-file {}", ".yaml"),
@@ -169,13 +172,14 @@ WRITTEN = {
     "log record directory", "log convert output", "learn collect folder", "learn evaluate misses",
     "learn train output", "models show folder", "models pull folder", "models export output",
     "calibrate lens output", "calibrate lens report", "recording.video", "recording.directory",
+    "signing new file", "bench chaos log",
 }  # fmt: skip
 # Read by what other rows run: the service opens them as `detect` does.
 ELSEWHERE = {"view source", "play scene", "log replay model", "source.uri"}
 NO_FILES = {
     "seeds", "ray", "vehicle_url", "classes", "runtime", "precision", "device", "command", "key", "sentence",
     "allow", "listen", "changes", "camera", "split", "policy", "algorithm", "name", "url", "to", "board",
-    "dictionary", "printed", "identifiers", "paper", "frame", "markers", "ros_arguments",
+    "dictionary", "printed", "identifiers", "paper", "frame", "markers", "ros_arguments", "serial",
 }  # fmt: skip
 # What these readers take: an image by its content; any text as a passphrase or key; an empty settings file.
 _IMAGES = {
@@ -188,6 +192,9 @@ ACCEPTED: dict[str, set[str]] = {name: kinds | {"fifo"} for name, kinds in _IMAG
     "source.depth": {"fifo"},
     "config": {"empty", "device"},
     "vehicle.signing_key_file": {"toml", "json"},
+    "signing send key_file": {"toml", "json"},
+    "signing send present_key_file": {"toml", "json"},
+    "init output": {"missing", "empty"},
     "language.key_file": {"json"},
     "mqtt.password_file": {"json"},
     "log show paths": {"folder"},
