@@ -83,14 +83,14 @@ class LineEditor:
 
     def view(self, columns: int) -> str:
         """Return prompt and line in one row of a terminal, the cursor in its place: a long line is cut."""
-        room = max(columns - 1 - _width(self._prompt), 1)
+        width = max(columns - 1 - _width(self._prompt), 1)
         start, end = 0, len(self.text)
-        if _width(self.text) > room:
+        if _width(self.text) > width:
             start = self.cursor
-            while start and _width(self.text[start - 1 : self.cursor]) <= room:
+            while start and _width(self.text[start - 1 : self.cursor]) <= width:
                 start -= 1
             end = self.cursor
-            while end < len(self.text) and _width(self.text[start : end + 1]) <= room:
+            while end < len(self.text) and _width(self.text[start : end + 1]) <= width:
                 end += 1
         after = _width(self.text[self.cursor : end])
         return f"{self._prompt}{self.text[start:end]}" + (f"\x1b[{after}D" if after else "")

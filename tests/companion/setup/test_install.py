@@ -175,7 +175,7 @@ def test_silent_service_is_not_taken_for_disarmed(
         ("/home/pi/venv", "/usr/bin/python3.11"),
         (str(INSTALLATIONS), "/usr/bin/python3.11"),
         (str(CURRENT), "/usr/bin/python3.11"),
-        (str(OLD), "/root/.pyenv/versions/3.11/bin/python3.11"),
+        (str(OLD), "/root/python/bin/python3.11"),
     ],
 )
 def test_environment_that_the_service_cannot_use_is_named(
