@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import errno
+import os
 from collections.abc import Awaitable, Callable
 
 import pytest
@@ -19,11 +21,15 @@ Answer = Callable[[int], int | None]
 
 
 class Server:
-    """A server of HTTP with given answers. `requests`: Idempotency-Key and body."""
+    """A server of HTTP with given answers. `requests`: Idempotency-Key and body; `said`: by the webhook."""
 
     def __init__(self, answer: Answer) -> None:
-        self._answer, self.requests = answer, list[tuple[str, bytes]]()
+        self._answer, self.requests, self.said = answer, list[tuple[str, bytes]](), list[str]()
         self.changed = asyncio.Event()
+
+    def say(self, line: str) -> None:
+        self.said.append(line)
+        self.changed.set()
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         while head := (await reader.readuntil(b"\r\n\r\n")).decode().lower():
@@ -44,25 +50,24 @@ def with_server(answer: Answer, work: Callable[[Webhook, Server], Awaitable[None
     """Run server and webhook meanwhile; returns what was said."""
 
     async def run() -> list[str]:
-        said: list[str] = []
         server = Server(answer)
         listening = await asyncio.start_server(server.serve, "127.0.0.1", 0)
         port = listening.sockets[0].getsockname()[1]
-        webhook = Webhook(f"http://127.0.0.1:{port}/?token=secret", said.append, QUICK)
+        webhook = Webhook(f"http://127.0.0.1:{port}/?token=secret", server.say, QUICK)
         running = asyncio.create_task(webhook.run())
         async with asyncio.timeout(WAIT_S):
             await work(webhook, server)
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
         listening.close()
-        assert not any("secret" in line for line in said)
-        return said
+        assert not any("secret" in line for line in server.said)
+        return server.said
 
     return asyncio.run(run())
 
 
-async def wait_for(server: Server, count: int) -> None:
-    while len(server.requests) < count:
+async def wait_for(server: Server, count: int, lines: int = 0) -> None:
+    while len(server.requests) < count or len(server.said) < lines:
         server.changed.clear()
         await server.changed.wait()
 
@@ -82,12 +87,49 @@ def test_another_status_is_final_and_a_fault_is_tried_four_times(status: int, tr
     async def work(webhook: Webhook, server: Server) -> None:
         webhook.put("a", b"1")
         webhook.put("b", b"2")
-        await wait_for(server, tries + 1)
+        await wait_for(server, tries + 1, lines=2)
         assert [key for key, _ in server.requests] == ["a"] * tries + ["b"]
 
     said = with_server(lambda number: 204 if number > tries else status, work)
+    assert all(f"status {status}" in line for line in said[:-1])
+    assert said[-1].endswith("posting again; 1 events were not delivered")
+    assert len(said) == 2
+
+
+def test_a_fault_is_said_when_it_begins_and_when_it_ends() -> None:
+    async def work(webhook: Webhook, server: Server) -> None:
+        for number in range(4):
+            webhook.put(str(number), b"{}")
+        await wait_for(server, 13, lines=2)  # three events four times each
+
+    said = with_server(lambda number: 500 if number <= 12 else 204, work)
+    assert len(said) == 2
+    assert said[1].endswith("posting again; 3 events were not delivered")
+
+
+def test_nobody_listening_is_called_so() -> None:
+    said: list[str] = []
+
+    async def run() -> None:
+        listening = await asyncio.start_server(lambda reader, writer: writer.close(), "127.0.0.1", 0)
+        port = listening.sockets[0].getsockname()[1]
+        listening.close()
+        await listening.wait_closed()
+        heard = asyncio.Event()
+        webhook = Webhook(
+            f"http://127.0.0.1:{port}/", lambda line: (said.append(line), heard.set())[0], (0.0, 0.0, 1e6)
+        )
+        webhook.put("a", b"{}")
+        running = asyncio.create_task(webhook.run())
+        async with asyncio.timeout(WAIT_S):
+            await heard.wait()
+        for number in range(MOST_EVENTS + 1):
+            webhook.put(str(number), b"{}")
+        running.cancel()
+
+    asyncio.run(run())
     assert len(said) == 1
-    assert f"status {status}" in said[0]
+    assert said[0].endswith(f"{os.strerror(errno.ECONNREFUSED)}; retrying")
 
 
 def test_a_server_that_hangs_costs_a_bounded_queue(monkeypatch: pytest.MonkeyPatch) -> None:
