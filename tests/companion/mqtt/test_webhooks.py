@@ -115,14 +115,14 @@ def test_nobody_listening_is_called_so() -> None:
         port = listening.sockets[0].getsockname()[1]
         listening.close()
         await listening.wait_closed()
-        heard = asyncio.Event()
+        noticed = asyncio.Event()
         webhook = Webhook(
-            f"http://127.0.0.1:{port}/", lambda line: (said.append(line), heard.set())[0], (0.0, 0.0, 1e6)
+            f"http://127.0.0.1:{port}/", lambda line: (said.append(line), noticed.set())[0], (0.0, 0.0, 1e6)
         )
         webhook.put("a", b"{}")
         running = asyncio.create_task(webhook.run())
         async with asyncio.timeout(WAIT_S):
-            await heard.wait()
+            await noticed.wait()
         for number in range(MOST_EVENTS + 1):
             webhook.put(str(number), b"{}")
         running.cancel()
