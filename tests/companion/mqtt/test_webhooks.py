@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
+import socket
 from collections.abc import Awaitable, Callable
 
 import pytest
 
 from companion.mqtt import webhooks
 from companion.mqtt.webhooks import MOST_BYTES, MOST_EVENTS, Webhook
+from mavlink_sim.testing import free_port
 
 pytestmark = pytest.mark.realtime
 
@@ -108,28 +110,21 @@ def test_a_fault_is_said_when_it_begins_and_when_it_ends() -> None:
 
 
 def test_nobody_listening_is_called_so() -> None:
-    said: list[str] = []
-
-    async def run() -> None:
-        listening = await asyncio.start_server(lambda reader, writer: writer.close(), "127.0.0.1", 0)
-        port = listening.sockets[0].getsockname()[1]
-        listening.close()
-        await listening.wait_closed()
-        noticed = asyncio.Event()
-        webhook = Webhook(
-            f"http://127.0.0.1:{port}/", lambda line: (said.append(line), noticed.set())[0], (0.0, 0.0, 1e6)
-        )
+    async def run() -> list[str]:
+        said: asyncio.Queue[str] = asyncio.Queue()
+        port = free_port(socket.SOCK_STREAM)
+        webhook = Webhook(f"http://127.0.0.1:{port}/", said.put_nowait, (0.0, 0.0, 1e6))
         webhook.put("a", b"{}")
         running = asyncio.create_task(webhook.run())
         async with asyncio.timeout(WAIT_S):
-            await noticed.wait()
+            lines = [await said.get()]
         for number in range(MOST_EVENTS + 1):
             webhook.put(str(number), b"{}")
         running.cancel()
+        return lines + [said.get_nowait() for _ in range(said.qsize())]
 
-    asyncio.run(run())
-    assert len(said) == 1
-    assert said[0].endswith(f"{os.strerror(errno.ECONNREFUSED)}; retrying")
+    (line,) = asyncio.run(run())
+    assert line.endswith(f"{os.strerror(errno.ECONNREFUSED)}; retrying")
 
 
 def test_a_server_that_hangs_costs_a_bounded_queue(monkeypatch: pytest.MonkeyPatch) -> None:
