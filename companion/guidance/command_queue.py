@@ -1,8 +1,9 @@
-"""Queue of commands: one that needs a gimbal, home or detections waits for the first report of it.
+"""Queue of commands: one that needs a gimbal, home, detections or the vehicle's type waits for it.
 
 The gimbal manager is asked; PX4 sends home every two seconds; a camera that has just started sends its first
-detections within seconds. After a standstill `stop`, `land` and `rtl` wait for the next heartbeat,
-and where it matters for the VTOL state.
+detections within seconds. Whether the vehicle is one that is flown (`vehicle_type`) is not known right after
+the link opens: ArduPilot sends EXTENDED_SYS_STATE only when it is requested. After a standstill `stop`,
+`land` and `rtl` wait for the next heartbeat, and where it matters for the VTOL state.
 
 A waiting command is superseded by another command, any change of mode or arming, a loss of command, a low
 battery, or the end of the service. The mode in the first heartbeat after a standstill supersedes nothing.
@@ -21,6 +22,7 @@ from companion.vehicle.state import VehicleState
 from companion.vehicle.vehicle_type import NOT_KNOWN_YET
 
 _GIMBAL, _AUTOPILOT = "the gimbal", "the autopilot's next reports"
+_TYPE = "the vehicle's type"
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,6 +129,8 @@ def _awaited(command: CommandInput, context: BehaviourContext) -> str:
     state = context.state
     if ends_flight(behaviour) and (not state.heartbeat_ns or state.not_flown in NOT_KNOWN_YET):
         return _AUTOPILOT
+    if behaviour is not None and state.connected(context.now_ns) and state.not_flown in NOT_KNOWN_YET:
+        return _TYPE
     needed = {Requirement.GIMBAL} if behaviour is None else set(behaviour.needs)
     for later in () if behaviour is None else behaviour.later:
         needed |= later.needs

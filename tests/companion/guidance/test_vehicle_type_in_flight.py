@@ -11,12 +11,16 @@ from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
+from companion.guidance.gimbal.controller import FIND_TIMEOUT_S
 from companion.guidance.interface import EventKind, GuidanceInput
-from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VtolState
+from companion.vehicle.state import FlightMode
+from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VTOL_STATE_MISSING, VtolState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying, parked
 
 FIXED_WING, QUADROTOR, ROVER, TILTROTOR = 1, 2, 10, 21
-Identity = tuple[str, int, int, VtolState]
+Identity = tuple[str, int, int, VtolState | None]
+UNKNOWN: Identity = ("ArduPilot", QUADROTOR, ARDUPILOT, None)
+COPTER: Identity = ("ArduPilot", QUADROTOR, ARDUPILOT, VtolState.UNDEFINED)
 HOVERING: Identity = ("PX4", TILTROTOR, PX4, VtolState.MC)
 QUADPLANE: Identity = ("ArduPilot", QUADROTOR, ARDUPILOT, VtolState.MC)
 NOT_FLOWN: list[Identity] = [
@@ -98,3 +102,35 @@ def test_hovering_vtol_of_px4_flies_like_a_multicopter() -> None:
     harness = Vehicle(HOVERING)
     engaged(harness)
     assert harness.outcome(harness.command("goto forward=2 right=0"), 30.0).success
+
+
+@pytest.mark.parametrize("text", ["takeoff 3", "goto 5 0"])
+def test_command_waits_until_the_type_is_known(text: str) -> None:
+    harness = Vehicle(UNKNOWN, in_the_air=not text.startswith("takeoff"))
+    harness.run(0.1)
+    pending = harness.command(text)
+    harness.run(FIND_TIMEOUT_S - 0.5)
+    assert not pending.done()
+    assert harness.autopilot.requests == []
+    harness.identity = COPTER
+    assert harness.outcome(pending, 40.0).success
+
+
+def test_command_is_refused_while_the_type_stays_unknown() -> None:
+    harness = Vehicle(UNKNOWN, in_the_air=False)
+    harness.run(0.1)
+    outcome = harness.outcome(harness.command("takeoff 3"), FIND_TIMEOUT_S + 0.5)
+    assert (outcome.success, outcome.reason) == (False, VTOL_STATE_MISSING)
+    assert harness.autopilot.requests == []
+
+
+def test_pilots_mode_supersedes_a_command_that_waits_for_the_type() -> None:
+    harness = Vehicle(UNKNOWN, in_the_air=False)
+    harness.run(0.1)
+    pending = harness.command("takeoff 3")
+    harness.run(0.1)
+    harness.autopilot.change_mode(FlightMode.POSITION)
+    assert_failed(harness.outcome(pending, 1.0), "superseded by ")
+    harness.identity = COPTER
+    harness.run(2.0)
+    assert harness.autopilot.requests == []
