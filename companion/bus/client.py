@@ -351,6 +351,7 @@ def listen(
     key: str,
     on_message: Callable[[str, str], None],
     *,
+    vehicle: str | None = None,
     history: bool = False,
 ) -> zenoh.Subscriber[None] | ext.AdvancedSubscriber[None]:
     """Call back, on a zenoh thread, with (key, text) of every message on `key` (wildcards allowed).
@@ -358,10 +359,12 @@ def listen(
     For binary data such as images, the text has the encoding, the length and the attachment.
 
     Args:
+        key: a topic, or a key with `companion/` in front, which names the vehicle itself.
+        vehicle: whose topic; None: of every vehicle.
         history: begin with the messages that the service has kept (`Topic.cached`), and recover lost ones.
             The subscription ends when the returned object is dropped.
     """
-    full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/*/{key}"
+    full = key if key.startswith(f"{ROOT}/") else f"{ROOT}/{vehicle or '*'}/{key}"
 
     def receive(sample: zenoh.Sample) -> None:
         on_message(str(sample.key_expr), _text_of(sample))

@@ -11,6 +11,7 @@ from companion.cli.flags import (
     YOLO,
     Limit,
     check_belonging,
+    named_vehicle,
     plain_errors,
     refuse,
     say_silent,
@@ -156,7 +157,10 @@ def echo(
         bool, typer.Option("--history", help="Begin with kept messages: events, tracks, status, camera_info.")
     ] = False,
 ) -> None:
-    """Print the messages of a running service. One line each: key and message."""
+    """Print the messages of the running services, or of that of vehicle.name if it is given.
+
+    One line each: key and message. A key that begins with companion/ names the vehicle itself.
+    """
     import queue
 
     from companion.bus.client import NoAnswerError, check_topic, client_settings, listen, open_client
@@ -166,7 +170,13 @@ def echo(
     with plain_errors(ValueError):
         check_topic(key)
     with plain_errors(NoAnswerError, BusError), open_client(client_settings(settings.zenoh)) as session:
-        subscriber = listen(session, key, lambda name, text: messages.put((name, text)), history=history)
+        subscriber = listen(
+            session,
+            key,
+            lambda name, text: messages.put((name, text)),
+            vehicle=named_vehicle(settings),
+            history=history,
+        )
         try:
             printed = 0
             while limit is None or printed < limit:

@@ -6,10 +6,11 @@ import json
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from subprocess import PIPE, Popen
+from subprocess import PIPE, Popen, TimeoutExpired
 
 import pytest
 import zenoh
@@ -87,13 +88,41 @@ def test_given_name_is_never_replaced(layer: str, tmp_path: Path) -> None:
     assert received == []
 
 
-def test_given_name_chooses_among_several(tmp_path: Path) -> None:
+@pytest.mark.parametrize("words", [("send", "hold"), ("ask", "stop")])
+def test_given_name_chooses_among_several(words: tuple[str, str], tmp_path: Path) -> None:
     with services("hawk", "vehicle1") as (endpoint, received):
-        done = companion_here(
-            "send", "hold", "--connect", endpoint, "--vehicle-name", "vehicle1", cwd=tmp_path
-        )
+        done = companion_here(*words, "--connect", endpoint, "--vehicle-name", "vehicle1", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert received == [("vehicle1", "hold")]
+    assert received == [("vehicle1", words[1])]
+
+
+@pytest.mark.parametrize(
+    ("key", "flags", "names"),
+    [
+        ("labels", ("--vehicle-name", "hawk"), {"hawk"}),
+        ("labels", (), {"hawk", "owl"}),
+        ("companion/owl/labels", ("--vehicle-name", "hawk"), {"owl"}),
+    ],
+)
+def test_echo_prints_the_messages_of_a_given_vehicle(
+    key: str, flags: tuple[str, ...], names: set[str], tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "companion.cli", "echo", key, "--limit", "6", *flags, "--connect"]
+    with (
+        publishing(name="owl") as (node, endpoint),
+        Popen([*command, endpoint], cwd=tmp_path, stdout=PIPE, text=True) as process,
+    ):
+        try:
+            until_s = time.monotonic() + 30.0
+            while process.poll() is None and time.monotonic() < until_s:
+                for name in ("hawk", "owl"):
+                    node.publish(f"companion/{name}/labels", "none")
+                with suppress(TimeoutExpired):
+                    process.wait(0.02)
+        finally:
+            process.kill()
+        printed, _ = process.communicate()
+    assert {line.split("/")[1] for line in printed.splitlines()} == names
 
 
 def test_without_a_vehicle_the_default_name_is_missed(tmp_path: Path) -> None:
@@ -127,10 +156,13 @@ def test_recorder_records_the_only_vehicle(tmp_path: Path) -> None:
             "--connect",
             endpoint,
         ]
-        process = Popen(command, cwd=tmp_path, stderr=PIPE, text=True)
-        assert process.stderr is not None
-        assert "'hawk'" in process.stderr.readline()
-        assert "recordings/hawk_" in process.stderr.readline()
-        process.send_signal(signal.SIGINT)
-        process.communicate(timeout=20)
+        with Popen(command, cwd=tmp_path, stderr=PIPE, text=True) as process:
+            try:
+                assert process.stderr is not None
+                assert "'hawk'" in process.stderr.readline()
+                assert "recordings/hawk_" in process.stderr.readline()
+                process.send_signal(signal.SIGINT)
+                process.communicate(timeout=20)
+            finally:
+                process.kill()
     assert process.returncode == 0
