@@ -12,9 +12,11 @@ import pytest
 
 from companion.doctor import board, camera_device, model
 from companion.doctor.check import Verdict, exit_code
-from companion.doctor.facts import CameraTrial, User, group_name
+from companion.doctor.facts import CameraTrial, Facts, User, group_name
 from companion.doctor.installation import check_packages
 from companion.doctor.listening import Received, Sender
+from companion.doctor.serial_line import possible_holders
+from companion.settings import Settings
 from tests.companion.doctor.computer import USER, Computer, found
 from vision.sources.v4l2 import FrameSize, PixelFormat, VideoDevice
 
@@ -424,3 +426,22 @@ def test_shell_that_started_doctor_is_no_reader(computer: Computer) -> None:
     computer.program(4_000_001, line)
     computer.program(os.getpid(), "companion doctor", parent=4_000_001)
     assert found(computer.checks(), "serial line", Verdict.OK)
+
+
+@pytest.mark.parametrize(
+    ("device", "command", "holds"),
+    [
+        ("ttyAMA0", "/usr/bin/mavlink-routerd /dev/ttyAMA0:921600", True),
+        ("ttyAMA0", "/sbin/getty -L ttyAMA0 115200", True),
+        ("ttyAMA0", "/usr/bin/tail /var/log/ttyAMA0.log", False),
+        ("pts/1", "/usr/bin/sleep 1", False),  # a number is no device
+        ("pts/1", "/usr/bin/mavlink-routerd 1:921600", False),
+    ],
+)
+def test_only_a_word_that_names_the_device_makes_a_holder(
+    computer: Computer, device: str, command: str, holds: bool
+) -> None:
+    computer.program(900, command)
+    facts = Facts(Settings(), computer.machine())
+    found_pids = [each.pid for each in possible_holders(computer.root / "dev" / device, facts)]
+    assert found_pids == ([900] if holds else [])
