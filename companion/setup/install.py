@@ -102,6 +102,7 @@ def _check_possible(host: Host) -> None:
     if not below(host.root, Path("/run/systemd/system")).is_dir():
         raise SetupError("systemd does not run here; start the service yourself: companion run")
     if host.user:
+        host.check_manager()
         if "active" in host.run(("systemctl", "show", UNIT, "--property=ActiveState")).split("="):
             raise SetupError(f"{UNIT} of the system runs already: sudo companion uninstall removes it")
     elif os.geteuid() != 0:

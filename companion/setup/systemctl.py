@@ -48,6 +48,18 @@ class Host:
         """Return a command of systemctl."""
         return ("systemctl", *(("--user",) if self.user else ()), *words)
 
+    def check_manager(self) -> None:
+        """Raise SetupError if the manager of this user cannot be reached; the system's is not asked."""
+        if not self.user:
+            return
+        try:
+            self.run(self.systemctl("show-environment"))
+        except SetupError as error:
+            raise SetupError(
+                f"{error}; no systemd manager of this user runs: log in as this user, not by su or sudo, or "
+                "sudo loginctl enable-linger $USER; both need the package libpam-systemd"
+            ) from error
+
     def journal(self, unit: str, since_s: float, lines: int) -> str:
         """Return the newest lines of a unit since a time of day, seconds since 1970."""
         of_unit = "--user-unit" if self.user else "--unit"

@@ -53,6 +53,7 @@ def uninstall(
     if not dry_run:
         if not host.user and os.geteuid() != 0:
             raise SetupError(f"this needs root: sudo {sys.argv[0]} uninstall")
+        host.check_manager()
         if not force:
             check_not_flying(host)
 

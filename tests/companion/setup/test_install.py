@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -202,6 +202,24 @@ def test_install_needs_root_and_systemd(
     with pytest.raises(SetupError, match=missing):
         computer.install()
     assert not computer.commands
+
+
+@pytest.mark.parametrize("change", [install.install, uninstall.uninstall])
+def test_missing_manager_of_the_user_is_one_line(
+    computer: Computer, change: Callable[..., object], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "own"))
+
+    def refused(command: Sequence[str]) -> str:
+        if "--user" in command:
+            raise SetupError(f"{' '.join(command)}: Failed to connect to bus: No medium found")
+        return ""
+
+    with pytest.raises(SetupError) as raised:
+        change(Host(user=True, root=computer.root, run=refused), computer.said.append)
+    (line,) = str(raised.value).splitlines()
+    assert all(word in line for word in ("No medium found", "libpam-systemd", "loginctl enable-linger"))
+    assert not (tmp_path / "own").exists()
 
 
 def test_login_terminals_of_the_serial_line_are_disabled(computer: Computer) -> None:
