@@ -293,10 +293,13 @@ def test_ctrl_c_right_after_the_start_with_a_camera_is_quiet(tmp_path: Path) -> 
         text=True,
         start_new_session=True,
     ) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("ready: ")
-        os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process
-        assert process.stdout.read() == "stopped\n"
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("ready: ")
+            os.killpg(process.pid, signal.SIGINT)  # as a terminal does it: to every process
+            assert process.stdout.read() == "stopped\n"
+        finally:
+            process.kill()
     assert process.returncode == 0
 
 

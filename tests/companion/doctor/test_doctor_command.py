@@ -192,17 +192,20 @@ def test_service_warns_of_a_misspelt_variable(tmp_path: Path, monkeypatch: pytes
 def test_status_redraws_until_ctrl_c(tmp_path: Path) -> None:
     with heartbeats() as port, running_service(port, ["--source", "none"], cwd=tmp_path) as service:
         command = [sys.executable, "-m", "companion.cli", "status", "--watch", "--connect", service.endpoint]
-        watching = subprocess.Popen(
+        with subprocess.Popen(
             command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        assert watching.stdout is not None
-        screens = 0
-        for line in watching.stdout:
-            screens += line.startswith("vehicle ")
-            if screens == 3:
-                break
-        watching.send_signal(signal.SIGINT)
-        _, errors = watching.communicate(timeout=30)
+        ) as watching:
+            try:
+                assert watching.stdout is not None
+                screens = 0
+                for line in watching.stdout:
+                    screens += line.startswith("vehicle ")
+                    if screens == 3:
+                        break
+                watching.send_signal(signal.SIGINT)
+                _, errors = watching.communicate(timeout=30)
+            finally:
+                watching.kill()
     assert (watching.returncode, errors) == (0, "")
 
 

@@ -50,17 +50,20 @@ def journal_of(program: list[str], cwd: Path, *, other: bool = False) -> tuple[i
         status = os.fstat(theirs.fileno())
         inode = status.st_ino + (1 if other else 0)
         environment = {**os.environ, "JOURNAL_STREAM": f"{status.st_dev}:{inode}", "NO_COLOR": "1"}
-        process = subprocess.Popen(
+        with subprocess.Popen(
             program,
             stdout=theirs.fileno(),
             stderr=theirs.fileno(),
             stdin=subprocess.DEVNULL,
             cwd=cwd,
             env=environment,
-        )
-        theirs.close()
-        lines = reader.read().decode().splitlines()
-        return process.wait(60), lines
+        ) as process:
+            try:
+                theirs.close()
+                lines = reader.read().decode().splitlines()
+                return process.wait(60), lines
+            finally:
+                process.kill()
 
 
 def test_every_line_has_the_priority_of_its_level(tmp_path: Path) -> None:

@@ -197,10 +197,13 @@ def test_recorder_joins_a_service_and_ends_with_a_killed_one(filming: list[str],
             "--connect",
             service.endpoint,
         ]
-        recorder = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE)
-        wait_for(lambda: files(joined) and messages_of(files(joined)[0])["guidance_input"] > 20)
-        recorder.terminate()
-        _, printed = recorder.communicate(timeout=60)
+        with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE) as recorder:
+            try:
+                wait_for(lambda: files(joined) and messages_of(files(joined)[0])["guidance_input"] > 20)
+                recorder.terminate()
+                _, printed = recorder.communicate(timeout=60)
+            finally:
+                recorder.kill()
         assert recorder.returncode == 0
         assert len(printed.splitlines()) == 2
 

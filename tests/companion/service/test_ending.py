@@ -128,14 +128,17 @@ def test_work_ends_in_order_by_each_way(way: str, tmp_path: Path) -> None:
     ended = tmp_path / "ended"
     program = [sys.executable, "-c", PROGRAM, str(ended)]
     with subprocess.Popen(program, stdout=subprocess.PIPE) as running:
-        assert running.stdout is not None
-        assert running.stdout.readline() == b"working\n"
-        if way == "reader":
-            running.stdout.close()
-        else:
-            for _ in range(2):
-                running.send_signal(signal.Signals[way])
-        assert running.wait(20) == 7
+        try:
+            assert running.stdout is not None
+            assert running.stdout.readline() == b"working\n"
+            if way == "reader":
+                running.stdout.close()
+            else:
+                for _ in range(2):
+                    running.send_signal(signal.Signals[way])
+            assert running.wait(20) == 7
+        finally:
+            running.kill()
     assert ended.exists()
 
 
