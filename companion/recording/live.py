@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import json
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
@@ -22,6 +21,7 @@ from companion.recording.convert import Converter, large_channel
 from companion.recording.files import Channel, Recorded
 from companion.recording.recorder import subscribe_all
 from companion.settings import ZenohSection
+from companion.settings.key_files import is_loopback
 
 MAX_KEPT_CHANNELS = 64
 """A camera has up to three, and each name on the bus may be a camera's."""
@@ -168,7 +168,7 @@ def serve(options: LiveOptions, ending: Event, say: Callable[[str], None]) -> No
         NoAnswerError: no service at the endpoint.
     """
     host = options.listen.rpartition(":")[0].strip("[]")
-    if host != "localhost" and not ipaddress.ip_address(host).is_loopback:
+    if not is_loopback(host):
         raise RecordingError(
             f"foxglove.listen: expected a loopback address, since there is no authentication, got {host}; "
             "from another computer use ssh -L"

@@ -8,6 +8,7 @@ import json
 import os
 import socket
 import struct
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from companion.bus.client import settings_for_child
 from companion.bus.session import Bus
 from companion.bus.topics import COMMAND_STATE, EVENTS, STATUS, TRACKS
 from companion.host.child_process import child_process
+from companion.recording import RecordingError
 from companion.recording.files import Channel, Recorded
 from companion.settings import ZenohSection
 from mavlink_sim.testing import free_port, running_simulator
@@ -196,6 +198,13 @@ def test_bytes_of_kept_messages_are_bounded() -> None:
             Recorded(Channel("tracks", "companion.tracks", b"{}"), number, bytes(live.MAX_KEPT_BYTES // 10))
         )
     assert [message.log_time_ns for message in kept] == list(range(10, 20))
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "[::]", "drone.local"])
+def test_host_that_others_can_reach_is_refused(host: str) -> None:
+    options = live.LiveOptions(ZenohSection(), "vehicle1", f"{host}:8765")
+    with pytest.raises(RecordingError, match=r"foxglove\.listen"):
+        live.serve(options, threading.Event(), lambda _: None)
 
 
 def test_service_reports_busy_port_and_bad_folder_and_runs(tmp_path: Path) -> None:
