@@ -590,3 +590,11 @@ def test_image_files_are_decoded_in_one_place() -> None:
         if re.search(r"\bcv2\.(imdecode|imread)", path.read_text())
     }
     assert found == DECODE_IMAGE_FILES
+
+
+def test_equal_keys_are_sorted_in_one_order_on_every_processor() -> None:
+    """numpy's default sort orders them by the processor's vector instructions: a replay would differ."""
+    for name, tree in trees_with("argsort", "companion", "vision", "mavlink_sim"):
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("argsort"):
+                assert "kind='stable'" in map(ast.unparse, node.keywords), f"{name}:{node.lineno}"

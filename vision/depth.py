@@ -220,7 +220,7 @@ def _surface(
     # Horizontal distance per metre along the optical axis.
     level = np.sqrt(np.maximum((rays * rays).sum(axis=1) - drop * drop, 0.0))
     ranges_m = level * along_m
-    order = np.argsort(ranges_m)
+    order = np.argsort(ranges_m, kind="stable")
     first = _first_of_object(ranges_m[order])
     first += int(_NEAR_FRACTION * (len(order) - first))
     index = order[first]

@@ -149,7 +149,7 @@ class _Field:
         """
         nodes = np.argwhere(self._region)
         away_m = np.hypot(*(self.positions(nodes) - position).T)
-        order = np.argsort(away_m)[: np.count_nonzero(away_m <= ESCAPE_M)]
+        order = np.argsort(away_m, kind="stable")[: np.count_nonzero(away_m <= ESCAPE_M)]
         spans = self.positions(nodes[order]) - position
         share = np.linspace(0.0, 1.0, math.ceil(ESCAPE_M / SPACING_M) + 1)
         rows, columns = self._grid.cells((position + share[:, None, None] * spans).reshape(-1, 2)).T
@@ -311,7 +311,7 @@ def _nearby(grid: OccupancyGrid, position: Point) -> tuple[Point, ...]:
     points = grid.points(np.argwhere(grid.occupied))
     north, east = (points - position).T
     away_m = np.hypot(north, east)
-    order = np.argsort(away_m)[: np.count_nonzero(away_m <= NEARBY_M)]
+    order = np.argsort(away_m, kind="stable")[: np.count_nonzero(away_m <= NEARBY_M)]
     _, first = np.unique(
         np.rint(np.arctan2(east[order], north[order]) / SECTOR_RAD) % SECTORS, return_index=True
     )

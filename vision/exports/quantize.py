@@ -165,5 +165,5 @@ def mean_probability_difference(
         )
         for levels in (expected, found)
     )
-    best = np.argsort(first.max(axis=0))[-cells:]
+    best = np.argsort(first.max(axis=0), kind="stable")[-cells:]
     return float(np.abs(first[:, best].max(axis=0) - second[:, best].max(axis=0)).mean())

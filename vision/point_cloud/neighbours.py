@@ -82,7 +82,7 @@ def neighbour_pairs(points: NDArray[np.float32], radius_m: float) -> Pairs:
     """
     # A little larger: rounding of a quotient must not move a neighbour two cells away.
     keys, (_, across, deep) = cell_keys(points, radius_m * 1.0001, _FLATTER)
-    order = np.argsort(keys)
+    order = np.argsort(keys, kind="stable")
     cells, starts, sizes = np.unique(keys[order], return_index=True, return_counts=True)
     bounds = np.append(starts, len(keys))
     cell_of = np.repeat(np.arange(len(cells)), sizes)
