@@ -21,9 +21,11 @@ from companion.guidance.command import BuildContext, Command, Number, behaviour
 from companion.guidance.motion import (
     ARRIVED_M,
     ARRIVED_MPS,
+    AT_LIMIT_M,
     POSITION_GAIN,
     Lasting,
     PositionController,
+    held_at_height,
     towards,
 )
 from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
@@ -71,6 +73,7 @@ class TakeoffBehaviour(Behaviour):
         self._controller = PositionController()
         self._altitude_now_m = 0.0
         self._low = False
+        self._down_mps = 0.0  # asked for in the update before
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
@@ -108,12 +111,10 @@ class TakeoffBehaviour(Behaviour):
         there = still and abs(missing_m) <= ALTITUDE_TOLERANCE_M
         still_s = self._still.held_s(still, now_ns)
         if self._there.held_s(there, now_ns) >= THERE_S:
-            return Outcome(
-                True,
-                f"took off, {self._altitude_now_m:.1f} m above home",
-                self._above(state, missing_m, self._top),
-            )
+            return self._success(state, missing_m)
         if now_ns > self._until_ns:
+            if still and abs(missing_m) <= AT_LIMIT_M and held_at_height(self._down_mps, context.sent):
+                return self._success(state, missing_m)
             return Outcome(
                 False, f"take-off timed out: {self._altitude_now_m:.1f} m of {self._altitude_m:g} m reached"
             )
@@ -130,8 +131,13 @@ class TakeoffBehaviour(Behaviour):
         standing = state.landed is LandedState.ON_GROUND  # what moves then is the estimate
         self._top = self._above(state, missing_m, None if standing else self._top)
         *_, down_mps = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
+        self._down_mps = down_mps
         sideways_mps = towards(self._top, state.position_ned_m or self._top, POSITION_GAIN, SIDEWAYS_MPS)
         return Setpoint.velocity((*sideways_mps, down_mps), now_ns, yaw_rad=self._yaw_rad)
+
+    def _success(self, state: VehicleState, missing_m: float) -> Outcome:
+        text = f"took off, {self._altitude_now_m:.1f} m above home"
+        return Outcome(True, text, self._above(state, missing_m, self._top))
 
     @staticmethod
     def _above(state: VehicleState, missing_m: float, top: Vector3 | None) -> Vector3:

@@ -152,6 +152,31 @@ def test_goto_that_stays_beside_its_goal_states_the_distance(error_mps: float, r
     assert (f"{away_m:.2f} m" in outcome.reason) is not reached
 
 
+@pytest.mark.parametrize(
+    ("command", "limits", "down_error_mps", "away_m"),
+    [
+        ("goto 0 0 altitude=20", Limits(max_altitude_m=20.0), 0.0, 0.3),
+        ("goto 0 0 altitude=20", Limits(max_altitude_m=20.0), -0.5, 0.65),
+        ("goto 0 0 altitude=3", Limits(min_altitude_m=3.0), 0.5, 0.65),
+        ("goto 30 0", Limits(max_distance_m=30.0), 0.0, 0.3),
+    ],
+)
+def test_goal_at_a_limit_is_reached_though_it_slows_down(
+    command: str, limits: Limits, down_error_mps: float, away_m: float
+) -> None:
+    vehicle = KinematicVehicle(velocity_error=(0.0, 0.0, down_error_mps))
+    outcome = known(Flight(command, vehicle, limits=limits).run(60.0))
+    assert outcome.success, outcome.reason
+    assert math.dist(vehicle.position, known(outcome.goal_ned_m)) <= away_m
+    assert -limits.max_altitude_m <= vehicle.position[2] <= -limits.min_altitude_m
+
+
+def test_vehicle_that_stays_far_from_a_limit_has_not_reached_it() -> None:
+    vehicle = KinematicVehicle(velocity_error=(0.0, 0.0, -1.2))
+    flight = Flight("goto 0 0 altitude=20", vehicle, limits=Limits(max_altitude_m=20.0))
+    assert_failed(flight.run(60.0), "no progress")
+
+
 def test_goal_beyond_a_limit_ends_without_progress() -> None:
     flight = Flight("goto north=60 east=0", limits=Limits(max_distance_m=30.0))
     assert_failed(flight.run(120.0), "no progress", "guidance")

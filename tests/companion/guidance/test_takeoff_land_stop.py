@@ -10,8 +10,9 @@ from companion.guidance.behaviour import BehaviourContext, ModeRequest, Outcome
 from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
+from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import FlightMode, LandedState, VehicleState
-from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded
+from tests.companion.guidance.guidance_harness import assert_failed, assert_succeeded, known
 from tests.companion.guidance.kinematic_vehicle import START_NS, KinematicVehicle
 
 PARKED = replace(
@@ -51,6 +52,21 @@ def test_takeoff_times_out_with_the_height_reached() -> None:
     behaviour = TakeoffBehaviour(5.0)
     behaviour.on_activate(context(0))
     assert_failed(behaviour.update(0.02, context(60, armed=True, mode=FlightMode.TAKEOFF)), "0.0 m of 5 m")
+
+
+@pytest.mark.parametrize(("cut", "altitude_m"), [(True, 9.65), (False, 9.65), (True, 8.9)])
+def test_takeoff_to_a_limit_that_slows_it_down_has_succeeded(cut: bool, altitude_m: float) -> None:
+    behaviour = TakeoffBehaviour(10.0)
+    behaviour.on_activate(context(0))
+    below = climbing(altitude_m, FlightMode.HOLD, LandedState.IN_AIR)
+    for seconds in (5.0, 6.5):
+        asked = behaviour.update(0.02, context(seconds, **below))
+    assert isinstance(asked, Setpoint)
+    north, east, down = known(asked.velocity_ned_mps)
+    sent = replace(asked, velocity_ned_mps=(north, east, 0.5 * down if cut else down))
+    outcome = behaviour.update(0.02, replace(context(90, **below), sent=sent))
+    assert isinstance(outcome, Outcome)
+    assert outcome.success is (cut and altitude_m > 9.0)
 
 
 LANDING = replace(PARKED, armed=True, mode=FlightMode.LAND, landed=LandedState.IN_AIR, heartbeat_ns=START_NS)
