@@ -115,6 +115,7 @@ def test_misuse_of_allowed_names_is_rejected(tmp_path: Path, program: bytes) -> 
         load_checkpoint(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert str(caught.value).isprintable()
+    assert [word for word in ("<class", "object at 0x") if word in str(caught.value)] == []
 
 
 def storage(kind: str = "FloatStorage", key: str = "0", count: int = 4) -> Any:

@@ -115,12 +115,16 @@ def _read(path: Path) -> Any:
         ) from None
 
 
+# `<class 'list'>`, `<vision.yolo.torch_archive.Stub object at 0x7f...>`
+_PYTHON_VALUE = re.compile(r"<(?:class ')?(?:[\w.]*\.)?(\w+)(?:'| object at 0x\w+)>")
+
+
 def _refused(reason: str) -> CheckpointError:
     """The error for a pickle that torch's reader refuses."""
     named = re.search(r"GLOBAL (.*?) (?:was not an allowed|whose module)", reason, re.DOTALL)
     if named is None:
         # torch adds a paragraph before its reason, and one after it.
-        reason = reason.split("\n\n")[-2:][0]
+        reason = _PYTHON_VALUE.sub(r"a \1", reason.split("\n\n")[-2:][0])
         return CheckpointError(
             f"its pickle is damaged, or asks for more than values ({reason:.200}); nothing was run. Copy or "
             "download it again"
