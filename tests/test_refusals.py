@@ -17,14 +17,16 @@ from benchmarks.flights import UnknownFlightError, flight_named, summary
 from companion.bench.detector import BenchError, read_result
 from companion.bus.messages import transforms_message
 from companion.geometry import formation
+from companion.geometry.fence import Fence
 from companion.guidance import Patrol, Seek, Select, Takeoff
 from companion.guidance.behaviour import ModeRequest
 from companion.guidance.command import NO_CONTEXT, GrammarError
 from companion.guidance.grammar import parse
 from companion.guidance.limits.battery import BatteryMinimum
 from companion.guidance.limits.envelope import Limits
-from companion.guidance.missions.mission_file import MissionError, read_mission
+from companion.guidance.missions.mission_file import MissionError, find_mission, read_mission
 from companion.guidance.objects.from_detections import HistoryError, StateHistory
+from companion.guidance.policy_file import PolicyError, find_policy
 from companion.host.peer_data import PeerDataError
 from companion.language.clauses import UnclearError
 from companion.language.sentences import understand
@@ -95,7 +97,7 @@ from vision.point_cloud import (
 from vision.recording import Recording
 from vision.runtimes.base import RuntimeUnusableError
 from vision.runtimes.source import read_source
-from vision.shared_frame import SharedFrameReader
+from vision.shared_frame import SharedFrameReader, segment_path
 from vision.sources import SourceError, SourceSettings, open_source
 from vision.sources.network import UdpStream
 from vision.sources.stream_formats import StreamError, Y4mParser, parse_y4m_header
@@ -409,6 +411,10 @@ GUIDANCE = [
         "400",
     ),
     row("select in a mission", lambda _: Select().build(NO_CONTEXT), GrammarError, "select: ", "mission"),
+    row("mission name long", lambda _: find_mission("x" * 245), MissionError, "mission 'xxx", "demo"),
+    row("mission name too long", lambda _: find_mission("x" * 600), MissionError, "'xxx", "too long"),
+    row("policy name too long", lambda _: find_policy("x" * 600), PolicyError, "'xxx", "too long"),
+    row("fence nan", lambda _: Fence(((0, 0), (1, math.nan), (2, 2))), ValueError, "corner", "1,nan"),
     row(
         "mission UTF-16",
         lambda f: read_mission(file(f, "m.toml", b"\xff\xfe\x00")),
@@ -646,7 +652,7 @@ def scene(text: str, *words: str) -> Row:
 
 
 def fault(text: str, *words: str) -> Row:
-    return row(f"fault {text}", lambda _: parse_fault(text, KINDS), FaultError, *words)
+    return row(f"fault {text[:40]}", lambda _: parse_fault(text, KINDS), FaultError, *words)
 
 
 def options(changes: dict[str, Any], *words: str) -> Row:
@@ -723,6 +729,13 @@ SIMULATOR = [
     options({"size": (8, 8)}, "sides", "32 to 4096", "8x8"),
     options({"seed": -1}, "seed", "-1"),
     fault("link_dely 1", "'link_dely'", "link_delay?"),
+    fault("", "''", "help"),
+    fault("at=3", "'at=3'", "help"),
+    fault(f"{'y' * 400} 1", "'yyyy", "help"),
+    fault(f"gps_loss {'y' * 400}", "gps_loss: ", "'yyyy"),
+    fault(f"gps_loss {'y' * 400}=1", "gps_loss: ", "'yyyy"),
+    fault(f"gps_loss {'y' * 400}=1 {'y' * 400}=1", "gps_loss: ", "yyyy", "twice"),
+    fault(f"link_delay {'y' * 400}", "link_delay: seconds=yyyy", "0 to 60 s"),
     fault("link_delay", "link_delay needs seconds", "link_delay SECONDS"),
     fault("link_delay x", "link_delay: seconds=x: ", "0 to 60 s"),
     fault("link_delay nan", "link_delay: seconds=nan: ", "0 to 60 s"),
@@ -1253,6 +1266,28 @@ SOURCES = [
         "payload ",
         "0 to 127",
         "'200'",
+    ),
+    row(
+        "name of shared memory",
+        lambda _: segment_path("n" * 300),
+        ValueError,
+        "shared memory",
+        "200 characters",
+        "'nnnn",
+    ),
+    row(
+        "source of shared memory",
+        lambda _: open_source(f"shm://{'n' * 300}"),
+        SourceError,
+        "shm://nnnn",
+        "200 characters",
+    ),
+    row(
+        "source of no shared memory",
+        lambda _: open_source(f"shm://{'n' * 100}", SourceSettings(open_timeout_s=0.3, retry_min_s=0.1)),
+        SourceError,
+        "'nnnn",
+        "No such file",
     ),
     source(
         "shm://test-none",

@@ -57,6 +57,7 @@ PAGE = 4096
 SLOT_HEADER_BYTES = 64
 MAX_ATTEMPTS = 50
 LOOK_FOR_SUCCESSOR_NS = 100_000_000
+_LONGEST_NAME = 200
 
 _MAGIC, _VERSION, _WIDTH, _HEIGHT, _DEPTH, _SLOTS, _SLOT_BYTES, _WRITTEN, _HEARTBEAT, _CLOSED, _PID = range(
     11
@@ -71,8 +72,11 @@ Words = NDArray[np.uint64]
 
 def segment_path(name: str) -> Path:
     """The file of a segment. Raises ValueError for a name that is not a plain file name."""
-    if not name or name in (".", "..") or "/" in name or "\0" in name or len(name) > 200:
-        raise ValueError(f"the name of a shared memory must be a plain file name, got {name!r}")
+    if not name or name in (".", "..") or "/" in name or "\0" in name or len(name) > _LONGEST_NAME:
+        raise ValueError(
+            f"the name of a shared memory must be a plain file name of at most {_LONGEST_NAME} characters, "
+            f"got {name[:80]!r}"
+        )
     if not SHARED_MEMORY_DIRECTORY.is_dir():
         raise FileNotFoundError(
             f"{SHARED_MEMORY_DIRECTORY} does not exist; shared frames need Linux's tmpfs there"

@@ -43,8 +43,11 @@ class Fence:
         for polygon, _ in self._areas():
             if len(polygon) < 3:
                 raise ValueError(f"a fence polygon needs at least 3 corners, got {len(polygon)}")
-            if not all(math.isfinite(value) for corner in polygon for value in corner):
-                raise ValueError("every corner of a fence polygon must be finite")
+            for north_m, east_m in polygon:
+                if not (math.isfinite(north_m) and math.isfinite(east_m)):
+                    raise ValueError(
+                        f"every corner of a fence polygon must be finite, got {north_m:g},{east_m:g}"
+                    )
             if crossing := _crossing_edges(polygon):
                 raise ValueError(f"the edges of a fence polygon must not cross; those from {crossing} do")
 

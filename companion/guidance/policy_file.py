@@ -108,7 +108,9 @@ def find_policy(name: str) -> Path:
     try:
         if path.is_file():
             return path
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise PolicyError(f"invalid policy name {name[:80]!r}: {error.strerror or error}") from error
+    except ValueError as error:
         raise PolicyError(f"invalid policy name {name[:80]!r}: {error}") from error
     if name in bundled:
         return bundled[name]

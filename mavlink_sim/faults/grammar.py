@@ -92,21 +92,31 @@ def parse_fault(text: str, kinds: Mapping[str, Kind]) -> Fault:
     words = text.split()
     plain = [word for word in words if "=" not in word]
     if not plain:
-        raise FaultError(f"{text!r} names no fault; there are: {', '.join(kinds)}")
+        raise FaultError(f"{text[:40]!r} names no fault; {_all(kinds)}")
     name, *positional = plain
-    kind = kinds.get(name)
-    if kind is None:
-        near = difflib.get_close_matches(name, kinds, 1)
-        hint = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(kinds)}"
-        raise FaultError(f"there is no fault {name!r}{hint}")
+    kind = kind_named(name, kinds)
     given: dict[str, str] = {}
     for word in words:
         key, equals, value = word.partition("=")
         if equals:
             if key in given:
-                raise FaultError(f"{name}: {key} is given twice")
+                raise FaultError(f"{name}: {key[:40]} is given twice")
             given[key] = value
     return make_fault(kind, positional, given)
+
+
+def kind_named(name: str, kinds: Mapping[str, Kind]) -> Kind:
+    """Return the kind of a name. Raises FaultError."""
+    if (kind := kinds.get(name)) is not None:
+        return kind
+    near = difflib.get_close_matches(name, kinds, 1)
+    hint = f"did you mean {near[0]}?" if near else _all(kinds)
+    raise FaultError(f"there is no fault {name[:40]!r}; {hint}")
+
+
+def _all(kinds: Mapping[str, Kind]) -> str:
+    """Where all kinds are, which are too many for an error."""
+    return f"the console's `help` lists all {len(kinds)}, as does docs/faults.md"
 
 
 def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> Fault:
@@ -131,8 +141,10 @@ def make_fault(kind: Kind, positional: list[str], given: Mapping[str, str]) -> F
             continue
         values[one.name] = _read(kind, one.name, one.read, text)
     if left or named:
-        stray = left[0] if left else f"{next(iter(named))}="
-        raise FaultError(f"{kind.name}: unexpected {stray!r}; usage: {kind.usage} [at=S] [for=S] [seed=N]")
+        stray = left[0] if left else f"{next(iter(named))[:39]}="
+        raise FaultError(
+            f"{kind.name}: unexpected {stray[:40]!r}; usage: {kind.usage} [at=S] [for=S] [seed=N]"
+        )
     return Fault(kind, values, at_s, duration_s, seed)
 
 
@@ -144,7 +156,7 @@ def _read(kind: Kind, name: str, read: Callable[[str], Any], text: str) -> Any:
     try:
         return read(text)
     except ValueError as error:
-        raise FaultError(f"{kind.name}: {name}={text}: expected {error}") from None
+        raise FaultError(f"{kind.name}: {name}={text[:40]}: expected {error}") from None
 
 
 def _shown(value: Any) -> str:

@@ -23,7 +23,7 @@ from typing import Any
 
 from mavlink_sim.camera.freeze import CameraFreeze
 from mavlink_sim.faults.context import ActiveFault, CommandCheck, FaultTarget, Gate
-from mavlink_sim.faults.grammar import Fault, FaultError, parse_fault
+from mavlink_sim.faults.grammar import Fault, FaultError, kind_named, parse_fault
 from mavlink_sim.faults.kinds import EFFECTS, KINDS
 from mavlink_sim.faults.link_effects import chosen_links
 from mavlink_sim.faults.message_effects import shifted
@@ -154,7 +154,7 @@ class Faults:
             if text == "all" or text == one.fault.kind.name or text == str(one.number)
         ]
         if not chosen and text != "all":
-            raise FaultError(f"there is no fault {text} to end; `list` shows the active ones")
+            raise FaultError(f"there is no fault {text[:40]} to end; `list` shows the active ones")
         for one in chosen:
             self._finish(one)
         return len(chosen)
@@ -306,9 +306,7 @@ class Faults:
 
 def _help(words: list[str]) -> list[str]:
     if words:
-        kind = KINDS.get(words[0])
-        if kind is None:
-            raise FaultError(f"there is no fault {words[0]!r}; there are: {', '.join(KINDS)}")
+        kind = kind_named(words[0], KINDS)
         lines = [f"{kind.usage} [at=S] {'' if kind.momentary else '[for=S] '}[seed=N]", f"  {kind.summary}"]
         return lines + [f"  {one.name}: {one.meaning}" for one in kind.fields]
     width = max(map(len, KINDS))

@@ -21,7 +21,7 @@ def check_name(name: str) -> None:
     try:
         segment_path(name)
     except (OSError, ValueError) as error:
-        raise SourceError(f"shm://{name}: {error}") from error
+        raise SourceError(f"shm://{name[:80]}: {error}") from error
 
 
 class SharedFrameCapture(Capture):
@@ -35,7 +35,8 @@ class SharedFrameCapture(Capture):
         try:
             self._reader = SharedFrameReader(name)
         except (OSError, ValueError) as error:
-            raise CaptureError(f"no frames in the shared memory {name!r} ({error})") from error
+            reason = (error.strerror if isinstance(error, OSError) else None) or error
+            raise CaptureError(f"no frames in the shared memory {name[:80]!r} ({reason})") from error
         self._stale_ns = round(settings.read_timeout_s * 1e9)
         self._after: int | None = None
         self.calibration = self._reader.calibration

@@ -129,12 +129,15 @@ def find_mission(name: str) -> Path:
         for candidate in (path, path.with_name(f"{path.name}.toml")):
             if candidate.is_file():
                 return candidate
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise MissionError(f"invalid mission name {name[:80]!r}: {error.strerror or error}") from error
+    except ValueError as error:
         raise MissionError(f"invalid mission name {name[:80]!r}: {error}") from error
     if name in bundled:
         return MISSIONS_FOLDER / f"{name}.toml"
     raise MissionError(
-        f"mission {name!r} not found: no such file in {Path.cwd()}; bundled missions: {', '.join(bundled)}"
+        f"mission {name[:80]!r} not found: no such file in {Path.cwd()}; "
+        f"bundled missions: {', '.join(bundled)}"
     )
 
 
