@@ -1,6 +1,6 @@
 """Print the objects that `companion` sends to ground stations: python decode_objects.py udpin:0.0.0.0:14550
 
-It needs pymavlink. The format is described in docs/how-to/ground-station.md.
+It needs pymavlink. The format is described in companion/ground_station/objects.py.
 """
 
 import struct
