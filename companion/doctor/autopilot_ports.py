@@ -88,8 +88,7 @@ def _ardupilot(parameters: Mapping[str, float]) -> Iterator[_Port]:
 CHECKS = (
     CheckKind(
         NAME,
-        "a port without the streams of a companion (`MAV_x_MODE`), or with MAVLink 1 (`SERIALx_PROTOCOL`); a "
-        "running service reads the parameters while the vehicle is disarmed",
+        "a port without the streams of a companion (`MAV_x_MODE`), or with MAVLink 1 (`SERIALx_PROTOCOL`)",
         _ports,
     ),
 )

@@ -226,5 +226,5 @@ CHECKS = (
         "scheduling", "a busy computer; the kernel, and whether a real-time policy is permitted", _scheduling
     ),
     CheckKind("disk", "little space for the journal, or less than `recording.max_total_mb`", _disk),
-    CheckKind("disk wear", "eMMC that is near the end of its life", _wear),
+    CheckKind("disk wear", "eMMC near the end of its life", _wear),
 )

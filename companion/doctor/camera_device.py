@@ -123,5 +123,5 @@ CHECKS = (
     CheckKind(
         NAME, "not there, not permitted, open in another program, a node or a format without images", _devices
     ),
-    CheckKind("camera", "without a service: no frames, a rate below `source.rate_hz`", _trials),
+    CheckKind("camera", "without a service: no frames, a low rate", _trials),
 )

@@ -98,8 +98,8 @@ def _advice(facts: Facts, wanted: int) -> str:
 CHECKS = (
     CheckKind(
         NAME,
-        "without a service: nothing received, another system id, several autopilots, bytes of a wrong baud "
-        "rate, a signature without a key",
+        "without a service: nothing received, another system id, several autopilots, a wrong baud rate, "
+        "a signature without a key",
         _heartbeats,
     ),
 )

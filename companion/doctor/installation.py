@@ -108,8 +108,8 @@ def _numbers(text: str) -> tuple[int, ...]:
 
 
 CHECKS = (
-    CheckKind("settings", "wrong settings; devices, models, folders, key files that they name", _settings),
-    CheckKind("settings files", "files of settings that are not read, and which are in force", _files),
+    CheckKind("settings", "wrong settings; missing devices, models, folders, key files", _settings),
+    CheckKind("settings files", "files that are not read, and which are in force", _files),
     CheckKind("environment", "`COMPANION_…` variables that are no setting", _variables),
     CheckKind("packages", "packages older than this version needs", _packages),
 )

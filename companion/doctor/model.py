@@ -101,6 +101,6 @@ def _torch(facts: Facts) -> Iterator[Check]:
 
 
 CHECKS = (
-    CheckKind("model", "a file that is not there, a licence, the bundled model on camera images", _models),
+    CheckKind("model", "a missing file, a licence, the bundled model on camera images", _models),
     CheckKind("torch", "torch with CUDA and no GPU, or `detector.device` cuda without", _torch),
 )

@@ -185,7 +185,7 @@ def _drops(facts: Facts) -> Iterator[Check]:
 
 VEHICLE_PORT = CheckKind(
     "vehicle port",
-    "the UDP port of `vehicle.url` taken, and which program has it",
+    "the UDP port of `vehicle.url` taken, and by which program",
     partial(_free, names=("vehicle port",)),
 )
 CHECKS = (

@@ -323,18 +323,14 @@ def _losses(facts: Facts) -> Iterator[Check]:
 
 CHECKS = (
     CheckKind("service", "no service, one that hangs or refuses, several", _service),
-    CheckKind(
-        "autopilot", "parts that are missing, with the service's reason: autopilot, zenoh, recorder", _parts
-    ),
+    CheckKind("autopilot", "missing parts, with the service's reason: autopilot, zenoh, recorder", _parts),
     CheckKind("vehicle type", "a vehicle that gets no flight commands", _flown),
     CheckKind("silence", "an autopilot that sinks, drifts or flies on when setpoints stop", _silence),
     CheckKind("link", "lost frames, bytes that are not MAVLink, slow streams, a failsafe", _link),
-    CheckKind("other commander", "another program or service that commands the vehicle", _commanders),
+    CheckKind("other commander", "another program or service in command", _commanders),
     CheckKind("time synchronization", "no answer to TIMESYNC, or a large error", _clocks),
     CheckKind("camera", "no frames, old results, a rate below `source.rate_hz`, a frozen image", _cameras),
-    CheckKind("detector", "a network that takes longer than the time between frames", _detectors),
+    CheckKind("detector", "a network that is slower than the camera", _detectors),
     CheckKind("gimbal", "no attitude, or no control", _gimbal),
-    CheckKind(
-        "messages", "messages and commands that were refused, lines of the log that were lost", _losses
-    ),
+    CheckKind("messages", "refused messages and commands, lost lines of the log", _losses),
 )

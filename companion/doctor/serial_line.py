@@ -175,8 +175,8 @@ def _line(facts: Facts) -> Iterator[Check]:
 
 
 CHECKS = (
-    CheckKind("serial device", "a device that is not there, and which are", _there),
-    CheckKind("serial permission", "a user who is not in the device's group", _permitted),
+    CheckKind("serial device", "a missing device, and which are there", _there),
+    CheckKind("serial permission", "a user outside the device's group", _permitted),
     CheckKind("serial line", "another reader: getty, nvgetty, a router, another program", _line),
     CheckKind("ModemManager", "ModemManager beside a USB serial device", _modem_manager),
     CheckKind("kernel console", "the kernel's messages on the autopilot's line", _kernel_console),
