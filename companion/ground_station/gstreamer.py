@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import shutil
+import time
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections.abc import Callable, Iterable
-from contextlib import AsyncExitStack
+from contextlib import AsyncExitStack, suppress
 from urllib.parse import quote
 
 from companion.ground_station import h264_child
@@ -15,7 +16,10 @@ from companion.host.child_process import supervised
 
 SYSTEM_PYTHON = "/usr/bin/python3"
 """Debian's gi is built for it alone."""
+UNTAKEN_S = 10.0
+"""A child that takes no image for this long is killed, and started again."""
 _NAME = "H.264"
+_END_S = 1.0  # it has nothing to finish, and the end of this process must not wait for it
 
 
 class H264Server:
@@ -47,6 +51,7 @@ class H264Server:
         self._on_wanted, self._say, self._python = on_wanted, say, python
         self.is_ready = False
         self._wanted: set[str] = set()
+        self._taken_s = 0.0
         self._process: Process | None = None
         self._stack = AsyncExitStack()
 
@@ -56,7 +61,7 @@ class H264Server:
             self._say(f"no H.264: no {self._python}")
             return
         await self._stack.enter_async_context(
-            supervised(_NAME, self._start, self._on_line, on_end=self._on_end)
+            supervised(_NAME, self._start, self._on_line, on_end=self._on_end, end_s=_END_S)
         )
 
     async def close(self) -> None:
@@ -65,10 +70,18 @@ class H264Server:
 
     def push(self, stream: str, jpeg: bytes, _stamp_ns: int) -> None:
         """Send an image to the stream's players; dropped while the child has not taken the one before."""
-        pipe = None if self._process is None else self._process.stdin
-        if stream in self._wanted and pipe is not None and not pipe.transport.get_write_buffer_size():
+        if stream not in self._wanted or (process := self._process) is None:
+            return
+        assert process.stdin is not None
+        if not process.stdin.transport.get_write_buffer_size():
+            self._taken_s = time.monotonic()
             number = list(self.paths).index(stream)
-            pipe.write(h264_child.HEADER.pack(number, len(jpeg)) + jpeg)
+            process.stdin.write(h264_child.HEADER.pack(number, len(jpeg)) + jpeg)
+        elif time.monotonic() - self._taken_s > UNTAKEN_S:
+            self._say(f"{_NAME}: no sign of life for {UNTAKEN_S:g} s")
+            self._set_wanted(stream, False)  # once
+            with suppress(ProcessLookupError):
+                process.kill()
 
     async def _start(self) -> tuple[Process, Callable[[], None]]:
         process = await asyncio.create_subprocess_exec(

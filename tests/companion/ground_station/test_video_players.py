@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import os
 import signal
+import socket
+import subprocess
 import sys
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from itertools import pairwise
 from pathlib import Path
@@ -18,6 +22,7 @@ import pytest
 from companion.ground_station import h264_child, rtsp
 from companion.ground_station.gstreamer import H264Server
 from companion.ground_station.rtsp import VideoServer
+from mavlink_sim.testing import free_port
 from tests.companion.ground_station.rtsp_client import number_of, numbered_jpeg, push_images
 from tests.companion.ground_station.video_players import HEIGHT, WIDTH, Player, ffmpeg, gstreamer
 
@@ -88,59 +93,177 @@ async def test_five_players_show_every_image_beside_a_stopped_one(monkeypatch: p
         assert [skipped(await shown(player, 5, 3.0)) for player in healthy] == [0] * 5
 
 
-@asynccontextmanager
-async def h264_stream() -> AsyncIterator[tuple[H264Server, str, list[bool]]]:
-    """A server with images at `RATE_HZ`, the stream's address, and when it was wanted."""
-    said, wanted = list[str](), list[bool]()
-    server = H264Server(
-        "127.0.0.1",
-        0,
-        ["front"],
-        token=TOKEN,
-        on_wanted=lambda _stream, change: wanted.append(change),
-        say=said.append,
-    )
-    await server.start()
+class H264Stream:
+    """An H.264 server with images at `RATE_HZ`.
 
-    async def push() -> None:
+    Attributes:
+        said: its lines. wanted: when its stream was wanted. pushes: images so far, and the longest time that
+            one kept the loop, seconds.
+    """
+
+    def __init__(self) -> None:
+        self.said, self.wanted = list[str](), list[bool]()
+        self.pushes, self.longest_push_s = 0, 0.0
+        self.server = H264Server(
+            "127.0.0.1",
+            free_port(socket.SOCK_STREAM),
+            ["front"],
+            token=TOKEN,
+            on_wanted=lambda _stream, change: self.wanted.append(change),
+            say=self.said.append,
+        )
+
+    @property
+    def uri(self) -> str:
+        return f"rtsp://127.0.0.1:{self.server.port}{self.server.paths['front']}"
+
+    @property
+    def child(self) -> int:
+        process = self.server._process
+        assert process is not None
+        return process.pid
+
+    async def push(self) -> None:
         for count in range(1_000_000):
-            server.push("front", numbered_jpeg(count % 256), 0)
+            begun_s = time.monotonic()
+            self.server.push("front", numbered_jpeg(count % 256), 0)
+            self.longest_push_s = max(self.longest_push_s, time.monotonic() - begun_s)
+            self.pushes += 1
             await asyncio.sleep(1 / RATE_HZ)
 
-    pushing = asyncio.create_task(push())
+
+async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+    async with asyncio.timeout(timeout_s):
+        while not condition():
+            await asyncio.sleep(0.01)
+
+
+@asynccontextmanager
+async def h264_stream(*, lines: int = 0) -> AsyncIterator[H264Stream]:
+    """`lines`: how many it says in the end."""
+    stream = H264Stream()
+    await stream.server.start()
+    pushing = asyncio.create_task(stream.push())
     try:
-        async with asyncio.timeout(60):
-            while not server.is_ready:
-                await asyncio.sleep(0.01)
-        yield server, f"rtsp://127.0.0.1:{server.port}{server.paths['front']}", wanted
+        await until(lambda: stream.server.is_ready)
+        yield stream
     finally:
         pushing.cancel()
-        await server.close()
-    assert said == []
+        await stream.server.close()
+    assert len(stream.said) == lines, stream.said
 
 
 @pytest.mark.needs("GStreamer")
 async def test_h264_is_shown_while_wanted() -> None:
-    async with h264_stream() as (_, uri, wanted):
-        assert wanted == []
-        async with ffmpeg(uri, "tcp") as player, gstreamer(uri, "tcp", H264) as other:
+    async with h264_stream() as stream:
+        assert stream.wanted == []
+        async with ffmpeg(stream.uri, "tcp") as player, gstreamer(stream.uri, "tcp", H264) as other:
             for one in (player, other):
                 assert skipped(await shown(one, IMAGES, 6.0)) <= IMAGES // 3
-            assert wanted == [True]
-        async with asyncio.timeout(30):
-            while wanted[-1]:
-                await asyncio.sleep(0.05)
+            assert stream.wanted == [True]
+        await until(lambda: not stream.wanted[-1], 30.0)
 
 
 @pytest.mark.needs("GStreamer")
 async def test_h264_needs_the_token_in_its_path() -> None:
-    async with h264_stream() as (server, uri, wanted):
+    async with h264_stream() as stream:
         for path in ("/front", "/front/0123456789abcdee", "/"):
-            async with ffmpeg(f"rtsp://127.0.0.1:{server.port}{path}", "tcp") as player:
+            async with ffmpeg(f"rtsp://127.0.0.1:{stream.server.port}{path}", "tcp") as player:
                 assert await player.process.wait() != 0
-        assert wanted == []
-        async with ffmpeg(uri, "udp") as player:
+        assert stream.wanted == []
+        async with ffmpeg(stream.uri, "udp") as player:
             await player.image()
+
+
+@pytest.mark.needs("GStreamer")
+async def test_h264_plays_beside_a_viewer_that_stopped_reading() -> None:
+    async with h264_stream() as stream:
+        async with ffmpeg(stream.uri, "tcp") as stopped, ffmpeg(stream.uri, "tcp") as player:
+            await asyncio.gather(stopped.image(), player.image())
+            stopped.process.send_signal(signal.SIGSTOP)
+            assert skipped(await shown(player, IMAGES, 6.0)) <= IMAGES // 3
+            assert stream.wanted == [True]
+        await until(lambda: not stream.wanted[-1], 30.0)
+
+
+@pytest.mark.needs("GStreamer")
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+async def test_h264_child_that_dies_or_hangs_is_replaced(
+    how: signal.Signals, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("companion.ground_station.gstreamer.UNTAKEN_S", 2.0)
+    lines = {signal.SIGKILL: 1, signal.SIGSTOP: 2}[how]  # one more says why it was killed
+    async with h264_stream(lines=lines) as stream:
+        async with ffmpeg(stream.uri, "tcp") as player:
+            await player.image()
+            first, pushes = stream.child, stream.pushes
+            os.kill(first, how)
+            await until(lambda: stream.wanted == [True, False])
+            await until(lambda: not stream.server.is_ready)  # it is not announced now
+            with pytest.raises(asyncio.IncompleteReadError):
+                async with asyncio.timeout(30.0):
+                    while True:
+                        await player.image()
+        await until(lambda: stream.server.is_ready)
+        assert stream.child != first
+        assert how is signal.SIGKILL or stream.pushes - pushes > RATE_HZ
+        assert stream.longest_push_s < 0.5
+        assert "-9" in stream.said[-1]
+        async with ffmpeg(stream.uri, "tcp") as player:
+            await shown(player, 5, 6.0)
+
+
+@pytest.mark.needs("GStreamer")
+async def test_h264_child_that_hangs_does_not_delay_the_end() -> None:
+    async with h264_stream(lines=1) as stream, ffmpeg(stream.uri, "tcp") as player:
+        await player.image()
+        child = stream.child
+        os.kill(child, signal.SIGSTOP)
+        await until(lambda: state_of(child) == "T")
+        begun_s = time.monotonic()
+        await stream.server.close()
+        assert time.monotonic() - begun_s < 4.0  # the process has 5 s, and videos to finish
+        assert state_of(child) == "X"
+
+
+PARENT = """
+import asyncio
+from companion.ground_station.gstreamer import H264Server
+
+async def main():
+    server = H264Server("127.0.0.1", 0, ["front"], token=None, on_wanted=lambda *_: None, say=print)
+    await server.start()
+    while not server.is_ready:
+        await asyncio.sleep(0.01)
+    print(server._process.pid, flush=True)
+    await asyncio.sleep(600)
+
+asyncio.run(main())
+"""
+
+
+@pytest.mark.needs("GStreamer")
+@pytest.mark.parametrize("hangs", [False, True])
+async def test_killed_process_leaves_no_h264_child(*, hangs: bool) -> None:
+    parent = await asyncio.create_subprocess_exec(sys.executable, "-c", PARENT, stdout=subprocess.PIPE)
+    try:
+        assert parent.stdout is not None
+        child = int(await parent.stdout.readline())
+        if hangs:
+            os.kill(child, signal.SIGSTOP)
+            await until(lambda: state_of(child) == "T")
+    finally:
+        parent.kill()
+        await parent.wait()
+    await until(lambda: state_of(child) in "ZX", 10.0)
+
+
+def state_of(pid: int) -> str:
+    """The state of a process as in /proc: T stopped, Z ended and its parent does not know, X: gone."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2][0]
+    except FileNotFoundError:
+        return "X"
 
 
 def test_child_is_of_python_3_9() -> None:
@@ -167,3 +290,27 @@ async def test_without_gstreamer_one_line_says_why() -> None:
         await server.close()
         assert len(said) == 1
         assert "no H.264: " in said[0]
+
+
+@pytest.fixture
+def no_encoder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """GStreamer without the plug-ins that have encoders of H.264."""
+    (installed,) = {file.parent for file in Path("/usr").glob("lib/*/gstreamer-1.0/libgstopenh264.so")}
+    for file in installed.glob("*.so"):
+        if not any(part in file.name for part in ("264", "v4l2", "video4linux2", "nv")):
+            (tmp_path / file.name).symlink_to(file)
+    monkeypatch.setenv("GST_PLUGIN_SYSTEM_PATH_1_0", str(tmp_path))
+    monkeypatch.setenv("GST_REGISTRY_1_0", str(tmp_path / "registry"))
+
+
+@pytest.mark.needs("GStreamer")
+@pytest.mark.usefixtures("no_encoder")
+async def test_without_an_encoder_one_line_names_those_tried() -> None:
+    stream = H264Stream()
+    await stream.server.start()
+    await until(lambda: stream.said)
+    stream.server.push("front", numbered_jpeg(0), 0)
+    await stream.server.close()
+    assert not stream.server.is_ready
+    (line,) = stream.said
+    assert all(name in line for name in h264_child.ENCODERS)
