@@ -22,13 +22,14 @@ _ANSWER_S = 15.0
 
 
 class OperatorStation:
-    """A station. `messages`: CLOCK_MONOTONIC nanoseconds of arrival, and the message, of component 100.
+    """A station. `messages`: CLOCK_MONOTONIC nanoseconds of arrival, and the message, of one camera.
 
     Args:
-        device: as pymavlink names it, `udpin:HOST:PORT` or `tcp:HOST:PORT`.
+        device: as pymavlink names it, `udpin:HOST:PORT` or `tcp:HOST:PORT`. camera: its component id.
     """
 
-    def __init__(self, device: str) -> None:
+    def __init__(self, device: str, camera: int = CAMERA) -> None:
+        self._camera = camera
         self._connection: Any = mavutil.mavlink_connection(device)
         self.messages: list[tuple[int, Any]] = []
         self._codec, self._decoder = mavlink.MAVLink(None, 255, 190), mavlink.MAVLink(None)
@@ -60,7 +61,7 @@ class OperatorStation:
         self.until(lambda: self.of("HEARTBEAT"), 60.0, "a camera")
         begun = len(self.messages)
         values = [*parameters, *[0.0] * (7 - len(parameters))]
-        self._send(mavlink.MAVLink_command_long_message(self._system_id, CAMERA, number, 0, *values))
+        self._send(mavlink.MAVLink_command_long_message(self._system_id, self._camera, number, 0, *values))
 
         def results() -> list[int]:
             acks = [message for _, message in self.of("COMMAND_ACK", begun)]
@@ -87,7 +88,7 @@ class OperatorStation:
             data = self._connection.recv(65535)
             now_ns = time.monotonic_ns()
             for frame in self._framer.feed(data, datagram=self._datagram):
-                if frame.component_id == CAMERA and frame.message_id in mavlink.mavlink_map:
+                if frame.component_id == self._camera and frame.message_id in mavlink.mavlink_map:
                     message = self._decoder.decode(bytearray(frame.raw))
                     with self._changed:
                         self._system_id = frame.system_id
@@ -96,10 +97,12 @@ class OperatorStation:
 
 
 @contextmanager
-def operator_station(device: str | None = None) -> Iterator[tuple[OperatorStation, str]]:
+def operator_station(
+    device: str | None = None, camera: int = CAMERA
+) -> Iterator[tuple[OperatorStation, str]]:
     """A station, and the url of `ground_station.url` to it. `device`: None: UDP on a free port."""
     port = free_port()
-    station = OperatorStation(device or f"udpin:127.0.0.1:{port}")
+    station = OperatorStation(device or f"udpin:127.0.0.1:{port}", camera)
     try:
         yield station, f"udpout://127.0.0.1:{port}"
     finally:

@@ -29,10 +29,16 @@ SERVICE, PROCESS, STATION = range(3)
 
 
 @asynccontextmanager
-async def flight(flags: list[str], folder: Path) -> AsyncIterator[tuple[ServiceProcess, MavsdkClient]]:
-    """Vehicle, service with its ground station process, and MAVSDK, all behind one router."""
+async def flight(
+    flags: list[str], folder: Path, *others: int
+) -> AsyncIterator[tuple[ServiceProcess, MavsdkClient]]:
+    """Vehicle, service with its ground station process, and MAVSDK, all behind one router.
+
+    `others`: ports of further stations.
+    """
     autopilot_port, station_port, service_port = (free_port() for _ in range(3))
-    async with mavlink_router(autopilot_port, [service_port, free_port(), station_port]) as router:
+    ports = [service_port, free_port(), station_port, *others]
+    async with mavlink_router(autopilot_port, ports) as router:
         with ExitStack() as stack:
             simulator = running_simulator(onboard_port=autopilot_port)
             await asyncio.to_thread(stack.enter_context, simulator)
