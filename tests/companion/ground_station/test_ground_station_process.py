@@ -100,14 +100,18 @@ async def test_camera_answers_again_after_its_process_was_killed(filming: list[s
     async with flight(filming, tmp_path) as (service, client):
         camera = client.plugin(CameraAsync)
         assert len(await found(camera)) == 1
-        pids = [pid for pid in _children(service.pid) if "companion.ground_station" in _command(pid)]
-        assert len(pids) == 1
         opened = "ground_station: open at"
         await asyncio.to_thread(service.wait_for_line, opened)
         line = len(service.lines)
-        os.kill(pids[0], signal.SIGKILL)
+        os.kill(process_of_cameras(service), signal.SIGKILL)
         await asyncio.to_thread(service.wait_for_line, opened, after=line)
         await camera.set_mode(CAMERA_ID, Mode.VIDEO)
+
+
+def process_of_cameras(service: ServiceProcess) -> int:
+    """Process id of the cameras' process of a service."""
+    (found,) = [pid for pid in _children(service.pid) if "companion.ground_station" in _command(pid)]
+    return found
 
 
 def _children(pid: int) -> list[int]:

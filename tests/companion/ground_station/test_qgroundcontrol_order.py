@@ -10,7 +10,7 @@ import heapq
 import random
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
@@ -32,6 +32,15 @@ LATER = {
 ALL = {"CAMERA_INFORMATION", *LATER}
 # At a telemetry radio's usual quality everything is there within this time.
 COMPLETE_S = 10.0
+
+
+class Clock(Protocol):
+    """Time and calls, seconds."""
+
+    @property
+    def now_s(self) -> float: ...
+
+    def after(self, seconds: float, call: Callable[[], None]) -> None: ...
 
 
 class Timeline:
@@ -59,7 +68,7 @@ class Timeline:
 class Station:
     """What QGroundControl does about one camera. `known`: what it has of it."""
 
-    def __init__(self, timeline: Timeline, send: Callable[[Message], None]) -> None:
+    def __init__(self, timeline: Clock, send: Callable[[Message], None]) -> None:
         self._timeline, self._send = timeline, send
         self.known: set[str] = set()
         self.acks_without_message = 0
