@@ -118,6 +118,22 @@ def put_until_somebody_listens(session: zenoh.Session, kind: str) -> None:
     publisher.put(tracks(kind))
 
 
+def put_short_tracks(session: zenoh.Session, count: int) -> None:
+    """Publish so many tracks that are new and end at once: two events of each."""
+    publisher = session.declare_publisher(
+        TRACKS.key("vehicle1"), congestion_control=zenoh.CongestionControl.BLOCK
+    )
+    each = [json.loads(tracks(kind)) for kind in ("new", "end")]
+    for first in range(0, count, 100):
+        events = [
+            body["events"][0] | {"track_id": number}
+            for number in range(first, min(first + 100, count))
+            for body in each
+        ]
+        publisher.put(json.dumps({**each[0], "events": events}))
+    publisher.undeclare()  # type: ignore[no-untyped-call]
+
+
 def pid_of(service: ServiceProcess, module: bytes) -> int:
     children = Path(f"/proc/{service.pid}/task/{service.pid}/children").read_text().split()
     (found,) = (int(pid) for pid in children if module in Path(f"/proc/{pid}/cmdline").read_bytes())
@@ -250,6 +266,62 @@ def test_nothing_of_images_is_encoded_without_a_new_object(lasting: tuple[Servic
         assert images[1] == images[2]
 
     with_station(port, work)
+
+
+def test_a_lost_broker_and_a_hanging_webhook_cost_events_alone(
+    port: int, filming: list[str], tmp_path: Path
+) -> None:
+    """What is lost is counted, and the end of a service that is killed is said."""
+    lost = 4000
+    with ExitStack() as stack:
+        hanging = stack.enter_context(socket.create_server(("127.0.0.1", 0)))  # takes requests, answers none
+        hook = f"http://127.0.0.1:{hanging.getsockname()[1]}/"
+        flags = [*filming, "--mqtt-url", f"mqtt://127.0.0.1:{port}", "--mqtt-webhooks", hook]
+        first = ExitStack()
+        stack.enter_context(first)
+        process = first.enter_context(mosquitto.broker(port, tmp_path))
+        autopilot = stack.enter_context(heartbeats())
+        service = stack.enter_context(running_service(autopilot, flags, cwd=tmp_path))
+        session = stack.enter_context(service.client())
+        publisher = pid_of(service, b"companion.mqtt")
+
+        async def while_the_webhook_hangs(station: Station) -> None:
+            await station.wait(f"{BASE}/available", b"online")
+            await asyncio.to_thread(put_until_somebody_listens, session, "new")
+            await station.wait(f"{BASE}/objects")
+            client, _ = await asyncio.to_thread(hanging.accept)
+            stack.enter_context(client)
+            assert (await asyncio.to_thread(client.recv, 4)) == b"POST"
+            begun_s = time.monotonic()
+            session.put(TRACKS.key("vehicle1"), tracks("end"))
+            assert json.loads(await station.wait(f"{BASE}/objects"))["event_type"] == "end"
+            assert time.monotonic() - begun_s < 2.0
+            await station.wait(f"{BASE}/state")
+
+        with_station(port, while_the_webhook_hangs)
+
+        process.kill()
+        service.wait_for_line("retrying")
+        put_short_tracks(session, lost // 2)
+        service.wait_for_line("it answers too slowly")
+        first.close()
+        noted = len(service.lines)
+        stack.enter_context(mosquitto.broker(port, tmp_path))
+        line = service.wait_for_line("events were not sent", 60.0, after=noted)
+        assert f"({lost} events" in line  # none waited
+        assert pid_of(service, b"companion.mqtt") == publisher
+
+        async def after_it_is_back(station: Station) -> None:
+            await station.wait(f"{BASE}/available", b"online")
+            await station.wait(f"{BASE}/state")
+            await asyncio.to_thread(put_until_somebody_listens, session, "new")
+            await station.wait(f"{BASE}/objects")
+            service.process.kill()
+            killed_s = time.monotonic()
+            await station.wait(f"{BASE}/available", b"offline")
+            assert time.monotonic() - killed_s < 5.0
+
+        with_station(port, after_it_is_back)
 
 
 def test_a_broker_that_takes_no_connection_delays_no_end(filming: list[str], tmp_path: Path) -> None:
