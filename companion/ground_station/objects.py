@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 import struct
-import time
 from collections.abc import Iterator
 from enum import IntFlag
 from typing import Any, ClassVar
@@ -26,6 +25,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.bus.bodies.frames import DetectionBody, DetectionsBody, ObjectBody
 from companion.ground_station.component import Message, Stream
 from companion.ground_station.tracking import Tracking
+from companion.host.clock import unix_offset_ns
 from companion.vehicle.framing import CRC_EXTRA, TARGET_RELATIVE_ID
 
 # Above 32767: not registered with MAVLink.
@@ -106,7 +106,7 @@ class Objects:
         if frame is None or now_ns - frame["captured_ns"] > _MAX_AGE_NS:
             return
         if selection is not None and selection.detection is not None and selection.frame is frame:
-            relative = target_relative(frame, selection.detection, now_ns)
+            relative = target_relative(frame, selection.detection)
             if relative is not None and self._targets.is_due(now_ns, frame["sequence"]):
                 yield relative
         any_now = bool(surest(frame))
@@ -142,7 +142,7 @@ class TargetRelative(mavlink.MAVLink_message):  # type: ignore[misc]
         return bytes(self._pack(mav, self.crc_extra, self.unpacker.pack(*self.fields), force_mavlink1))
 
 
-def target_relative(frame: DetectionsBody, seen: DetectionBody, now_ns: int) -> TargetRelative | None:
+def target_relative(frame: DetectionsBody, seen: DetectionBody) -> TargetRelative | None:
     """Return where a detection was from the vehicle, at the frame's capture; None: its range is not known.
 
     North, east and down of the vehicle. The deviations contain the vehicle's own position error. That of the
@@ -161,7 +161,7 @@ def target_relative(frame: DetectionsBody, seen: DetectionBody, now_ns: int) -> 
             math.hypot(major_m * cosine, minor_m * sine),
             math.hypot(major_m * sine, minor_m * cosine),
         )
-    captured_us = (time.time_ns() - now_ns + frame["captured_ns"]) // 1000
+    captured_us = (unix_offset_ns() + frame["captured_ns"]) // 1000
     return TargetRelative(
         captured_us,
         range_m * math.cos(bearing_rad),

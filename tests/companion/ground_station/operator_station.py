@@ -13,7 +13,8 @@ from typing import Any
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common as mavlink
 
-from companion.vehicle.framing import Framer
+from companion.ground_station.objects import TargetRelative
+from companion.vehicle.framing import TARGET_RELATIVE_ID, Framer
 from mavlink_sim.testing import free_port
 
 CAMERA = 100
@@ -22,7 +23,12 @@ _ANSWER_S = 15.0
 
 
 class OperatorStation:
-    """A station. `messages`: CLOCK_MONOTONIC nanoseconds of arrival, and the message, of one camera.
+    """A station.
+
+    Attributes:
+        messages: CLOCK_MONOTONIC nanoseconds of arrival, and the message, of one camera.
+        targets: TARGET_RELATIVE of it, which pymavlink does not know: time (UNIX, microseconds), and north,
+            east and down of the vehicle (m).
 
     Args:
         device: as pymavlink names it, `udpin:HOST:PORT` or `tcp:HOST:PORT`. camera: its component id.
@@ -32,6 +38,7 @@ class OperatorStation:
         self._camera = camera
         self._connection: Any = mavutil.mavlink_connection(device)
         self.messages: list[tuple[int, Any]] = []
+        self.targets: list[tuple[int, tuple[float, float, float]]] = []
         self._codec, self._decoder = mavlink.MAVLink(None, 255, 190), mavlink.MAVLink(None)
         self._framer, self._datagram = Framer(), device.startswith("udp")
         self._system_id = 0
@@ -88,6 +95,10 @@ class OperatorStation:
             data = self._connection.recv(65535)
             now_ns = time.monotonic_ns()
             for frame in self._framer.feed(data, datagram=self._datagram):
+                if frame.component_id == self._camera and frame.message_id == TARGET_RELATIVE_ID:
+                    layout = TargetRelative.unpacker
+                    time_us, *offset_m = layout.unpack(frame.padded(layout.size))[:4]
+                    self.targets.append((time_us, (offset_m[0], offset_m[1], offset_m[2])))
                 if frame.component_id == self._camera and frame.message_id in mavlink.mavlink_map:
                     message = self._decoder.decode(bytearray(frame.raw))
                     with self._changed:

@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from companion.ground_station.component import RequestTable
 from companion.ground_station.objects import MOST_BYTES, PAYLOAD_TYPE, Objects, encode, target_relative
 from companion.ground_station.tracking import Tracking
+from companion.host.clock import unix_offset_ns
 from companion.vehicle.framing import frames_of
 from mavlink_sim.testing import free_port
 from tests.companion.ground_station.bodies import (
@@ -182,12 +183,13 @@ def test_objects_of_an_old_frame_are_not_sent() -> None:
 
 
 def test_target_relative_is_a_valid_frame() -> None:
-    message = target_relative(frame(), detection(300, (0, 0, 9, 9)), NOW_NS)
+    message = target_relative(frame(), detection(300, (0, 0, 9, 9)))
     assert message is not None
     codec = mavlink.MAVLink(None, 1, 100)
     (sent,) = frames_of(message.pack(codec))
     assert (sent.message_id, sent.checked) == (511, True)
     fields = message.unpacker.unpack(sent.padded(message.unpacker.size))
+    assert fields[0] == pytest.approx((unix_offset_ns() + frame()["captured_ns"]) / 1000, abs=1000.0)
     assert fields[1:4] == pytest.approx((8 * math.cos(0.5), 8 * math.sin(0.5), 6.0))
     assert fields[4:6] == pytest.approx((2.0, 1.0))
     assert all(map(math.isnan, fields[6:12]))

@@ -16,7 +16,8 @@ from pymavlink.dialects.v20 import common as mavlink
 from zenoh import Session
 
 from companion.bus.client import listen, send_command
-from companion.bus.topics import COMMAND_STATE, DETECTIONS, VEHICLE
+from companion.bus.topics import COMMAND_STATE, DETECTIONS, TRANSFORMS, VEHICLE
+from companion.host.clock import unix_offset_ns
 from tests.companion.ground_station.operator_station import OperatorStation, operator_station
 from tests.companion.simulation.test_play import playing
 
@@ -43,19 +44,29 @@ HELD_M = 1.0
 TOLERANCE_PX = 1.0
 MAX_NEWER = 2
 """Frames published between that of a box and its arrival: the limit in time is in test_tracking."""
+SAME_TIME_US = 5000
+"""Between the time of TARGET_RELATIVE, by the computer's clock, and a frame's; frames are 100 ms apart."""
+TARGET_TOLERANCE_M = 0.1
 ACTIVE = mavlink.CAMERA_TRACKING_STATUS_FLAGS_ACTIVE
 
 
 class Bus:
-    """What the service publishes. `frames`: by number. `commands`: (command, state) in their order."""
+    """What the service publishes.
+
+    Attributes:
+        frames: by number. positions: of the vehicle at a frame's capture, local NED, by its number.
+        commands: (command, state) in their order.
+    """
 
     def __init__(self, session: Session) -> None:
         self._session = session
         self.frames: dict[int, dict[str, Any]] = {}
+        self.positions: dict[int, tuple[float, float, float]] = {}
         self.commands: list[tuple[str, str]] = []
         self.vehicle: dict[str, Any] = {}
         self._kept = [
             listen(session, DETECTIONS.name, self._on_frame),
+            listen(session, TRANSFORMS.name, self._on_transforms),
             listen(session, COMMAND_STATE.name, self._on_command),
             listen(session, VEHICLE.name, self._on_vehicle),
         ]
@@ -63,6 +74,11 @@ class Bus:
     def _on_frame(self, _key: str, text: str) -> None:
         body = json.loads(text)
         self.frames[body["sequence"]] = body
+
+    def _on_transforms(self, _key: str, text: str) -> None:
+        body = json.loads(text)
+        ned_from_body = body["transforms"][0]
+        self.positions[body["sequence"]] = tuple(ned_from_body["translation_m"])
 
     def _on_command(self, _key: str, text: str) -> None:
         body = json.loads(text)
@@ -129,6 +145,40 @@ def check_status(
     return ages_ms, newer
 
 
+def target_errors_m(station: OperatorStation, bus: Bus, track_id: int) -> list[tuple[float, float]]:
+    """Compare each TARGET_RELATIVE with its object in the frame of its time, and the vehicle's position then.
+
+    Returns:
+        Horizontal and vertical differences, metres.
+    """
+    unix_us = unix_offset_ns() // 1000
+    errors_m = []
+    frames = sorted(bus.frames.values(), key=lambda frame: int(frame["captured_ns"]))
+    for time_us, (north_m, east_m, down_m) in tuple(station.targets):
+        frame = min(frames, key=lambda each: abs(each["captured_ns"] // 1000 + unix_us - time_us))
+        assert abs(frame["captured_ns"] // 1000 + unix_us - time_us) < SAME_TIME_US
+        (seen,) = [each for each in frame["detections"] if each["track_id"] == track_id]
+        if frame["sequence"] not in bus.positions:
+            continue  # published before this program listened
+        north, east, down = (
+            there - here
+            for there, here in zip(seen["position_ned_m"], bus.positions[frame["sequence"]], strict=True)
+        )
+        errors_m.append((math.hypot(north_m - north, east_m - east), abs(down_m - down)))
+    return errors_m
+
+
+def error_figures(errors_m: Sequence[tuple[float, float]]) -> dict[str, float]:
+    """Median and largest of `target_errors_m`, millimetres."""
+    across, down = ([1000 * each for each in of] for of in zip(*errors_m, strict=True))
+    return {
+        "across_mm": median(across),
+        "across_max_mm": max(across),
+        "down_mm": median(down),
+        "down_max_mm": max(down),
+    }
+
+
 def _off_px(sent: Sequence[float], xyxy: Sequence[float], size: tuple[int, int]) -> float:
     return max(abs(one * scale - other) for one, other, scale in zip(sent, xyxy, size * 2, strict=True))
 
@@ -153,6 +203,7 @@ def test_rectangle_of_a_station_is_followed_if_allowed(tmp_path: Path, *, follow
     with operator_station() as (station, url):
         flags = ["--scene", str(scene), "--ground-station-url", url, "--guidance-obstacles", "off"]
         flags += ["--ground-station-track-follows", str(follows).lower()]
+        flags += ["--ground-station-target-relative", str(follows).lower()]
         with playing(tmp_path, *flags) as running, running.client() as session:
             bus = Bus(session)
             bus.fly("takeoff 4")
@@ -175,6 +226,11 @@ def test_rectangle_of_a_station_is_followed_if_allowed(tmp_path: Path, *, follow
             assert len(ages_ms) > 2 * watched_s
             assert median(newer) <= MAX_NEWER
             assert any(command.startswith("follow") for command, _ in bus.commands) == follows
+            errors_m = target_errors_m(station, bus, track_id)
+            assert bool(errors_m) == follows
+            if errors_m:
+                print(f"{len(errors_m)} TARGET_RELATIVE: {error_figures(errors_m)}")
+            assert all(max(each) < TARGET_TOLERANCE_M for each in errors_m)
             selected = [each for each in objects_of(station, begun) if each["selected"]]
             assert {(each["class"], each["track"]) for each in selected} == {("car", track_id)}
             before = len(bus.commands)
