@@ -379,12 +379,14 @@ def test_worker_dies_with_a_killed_service_without_torch(photos: Path, exported_
     arguments += ["detector.runtime=onnxruntime", "detector.image_size=64", "detector.threads=1"]
     command = [sys.executable, "-c", SERVICE, *arguments]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        first, *results = (process.stdout.readline().split() for _ in range(3))
-        assert first[0] == "pid"
-        assert results == [["result", "False"]] * 2
-        assert alive(int(first[1]))
-        process.kill()
+        try:
+            assert process.stdout is not None
+            first, *results = (process.stdout.readline().split() for _ in range(3))
+            assert first[0] == "pid"
+            assert results == [["result", "False"]] * 2
+            assert alive(int(first[1]))
+        finally:
+            process.kill()
     deadline_s = time.monotonic() + DEADLINE_S
     while alive(int(first[1])):
         assert time.monotonic() < deadline_s, "the worker outlived its service"
