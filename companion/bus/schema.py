@@ -96,7 +96,17 @@ def payload_of(topic: Topic) -> str:
     return "text" if topic.encoding == zenoh.Encoding.TEXT_PLAIN else "JSON"
 
 
-COLUMNS = ("name", "payload", "published", "max age", "kept")
+def _contents(topic: Topic) -> str:
+    kind = payload_of(topic)
+    return topic.description if kind == "JSON" else f"{kind}: {topic.description}"
+
+
+def _max_age_and_kept(topic: Topic) -> str:
+    age = [] if topic.max_age_s is None else [f"{topic.max_age_s:g} s"]
+    return "; ".join(age + [f"newest {topic.cached}"] * bool(topic.cached))
+
+
+COLUMNS = ("name", "payload, JSON unless stated", "published", "max age; kept")
 
 
 def topic_rows() -> list[tuple[str, ...]]:
@@ -104,10 +114,9 @@ def topic_rows() -> list[tuple[str, ...]]:
     return [
         (
             topic.name,
-            f"{payload_of(topic)}: {topic.description}",
+            _contents(topic),
             topic.published,
-            "–" if topic.max_age_s is None else f"{topic.max_age_s:g} s",
-            str(topic.cached or "–"),
+            _max_age_and_kept(topic),
         )
         for topic in ALL_TOPICS
     ]

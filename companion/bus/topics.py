@@ -119,7 +119,7 @@ MARKERS: Final = Topic(
 DEPTH: Final = Topic(
     "depth",
     DepthBody,
-    "distance at the centre of the image and of each detection, share of pixels with depth",
+    "distance at the image's centre and of each detection, share of pixels with depth",
     "per processed frame with depth",
     max_age_s=0.5,
     of_camera=True,
@@ -146,8 +146,8 @@ CAMERA_INFO: Final = Topic(
 IMAGE: Final = Topic(
     "image",
     ImageBody,
-    "a frame, with `preview.annotate` with its detections drawn; the attachment has its number",
-    "at most `preview.rate_hz`, only with subscribers",
+    "a frame, with `preview.annotate` its detections; the attachment has its number",
+    "at most `preview.rate_hz`",
     rate_hz=15.0,
     max_age_s=1.0,
     largest_bytes=LARGEST_IMAGE_BYTES,
@@ -159,7 +159,7 @@ DEPTH_IMAGE: Final = Topic(
     "depth_image",
     DepthImageBody,
     "the depth image of the same frame as `image`; the attachment has its size",
-    "at most `preview.rate_hz`, only with subscribers, of cameras with depth",
+    "at most `preview.rate_hz`",
     rate_hz=15.0,
     max_age_s=1.0,
     largest_bytes=LARGEST_BINARY_BYTES,
@@ -171,7 +171,7 @@ CLOUD: Final = Topic(
     "cloud",
     CloudBody,
     "the points of a depth image with their colours; the attachment has their number and frame",
-    "at most `preview.cloud_rate_hz`, only with subscribers, of cameras with depth",
+    "at most `preview.cloud_rate_hz`",
     rate_hz=2.0,
     max_age_s=1.0,
     largest_bytes=LARGEST_BINARY_BYTES,
@@ -238,7 +238,7 @@ EVENTS: Final = Topic(
 COMMAND_STATE: Final = Topic(
     "command_state",
     CommandStateBody,
-    "a command of any sender was accepted, is in progress, or has ended, and why",
+    "how far a command of any sender is, and why it ended",
     "on occurrence",
     cached=100,
 )

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any, get_args
 
 import pytest
 from jsonschema import Draft202012Validator, ValidationError
 
+from companion.bus.bodies.frames import (
+    FrameBody,
+    MarkerBody,
+    ObjectBody,
+    PositionBody,
+    TrackEventBody,
+)
 from companion.bus.bodies.service import CommandReplyBody, EventBody
 from companion.bus.schema import ALL_TOPICS, schema_of, topic_table, topics_markdown, write_schemas
 from companion.guidance.formation.pose import Role
@@ -18,7 +26,7 @@ from tests.companion.command_line import companion_here
 from vision.detections import TRACK_CONFIRMED, TRACK_NONE, TRACK_TENTATIVE
 from vision.tracking import TrackEventKind
 
-ROOT = Path(__file__).parents[3]
+MESSAGES = (Path(__file__).parents[3] / "docs" / "messages.md").read_text()
 
 
 @pytest.mark.parametrize("topic", ALL_TOPICS, ids=lambda topic: topic.name)
@@ -57,27 +65,37 @@ def test_mission_reply_has_steps() -> None:
 
 
 def test_table_in_the_document_is_that_of_the_code() -> None:
-    assert topics_markdown() in (ROOT / "docs" / "messages.md").read_text()
+    assert topics_markdown() in MESSAGES
 
 
-def test_example_bodies_in_the_document_are_valid() -> None:
-    text = (ROOT / "docs" / "messages.md").read_text()
-    checked = set()
-    for section in text.split("\n## ")[1:]:
-        name = section.partition("\n")[0].split(",")[0].strip()
-        _, found, block = section.partition("```json\n")
-        if not found or name not in {topic.name for topic in ALL_TOPICS} - {"vehicle", "status"}:
-            continue
-        check_message(name, json.loads(block.partition("```")[0]))
-        checked.add(name)
-    assert checked == {
-        "detections",
-        "tracks",
-        "pose",
-        "markers",
-        "velocity",
-        "command_state",
-    }
+def section(name: str) -> str:
+    (found,) = re.findall(rf"^## {name}\n(.*?)^## ", MESSAGES, re.MULTILINE | re.DOTALL)
+    return str(found)
+
+
+def example(name: str) -> dict[str, Any]:
+    """The example of a topic; that of tracks omits fields that the example of detections has."""
+    (block,) = re.findall(r"^```json\n(.*?)^```", section(name), re.MULTILINE | re.DOTALL)
+    body: dict[str, Any] = json.loads(block)
+    if name == "tracks":
+        frame = example("detections")
+        (detection,) = frame["detections"]
+        body = {**{key: frame[key] for key in [*FrameBody.__annotations__, "objects"]}, **body}
+        for event in body["events"]:
+            same = TrackEventBody.__annotations__.keys() & detection.keys()
+            event |= {key: detection[key] for key in same | PositionBody.__annotations__.keys()}
+    return body
+
+
+@pytest.mark.parametrize("name", ["detections", "tracks", "pose", "velocity", "command_state"])
+def test_example_body_in_the_document_is_valid(name: str) -> None:
+    check_message(name, example(name))
+
+
+@pytest.mark.parametrize(("name", "body"), [("objects", ObjectBody), ("markers", MarkerBody)])
+def test_every_field_is_in_the_document(name: str, body: Any) -> None:
+    (fields,) = re.findall(r": ((?:`\w+`,?\s?)+)\.", section(name))
+    assert re.findall(r"\w+", fields) == [*body.__annotations__]
 
 
 def test_schema_files(tmp_path: Path) -> None:
