@@ -36,6 +36,8 @@ from vision.attitude import wrap_angle
 
 # Nearer to the centre than this the outward direction is undefined.
 MIN_RADIUS_M = 0.2
+# Points of the circle that are checked against the limits before it begins.
+_CHECKED_POINTS = 36
 # Initial delays of velocity, acceleration and heading of a multirotor; the integrals below correct the rest.
 # The heading's is about 1 / MC_YAW_P; 0.34 s measured in lockstep.
 VELOCITY_DELAY_S = 0.1
@@ -128,15 +130,26 @@ class OrbitBehaviour(Behaviour):
         self._asked_mps = (0.0, 0.0)
         self._until_ns: float = math.inf
 
+    def _point_ahead(self, context: BehaviourContext) -> Vector3:
+        (north, east, down), yaw_rad = position_and_yaw(context.state)
+        return north + self._radius_m * math.cos(yaw_rad), east + self._radius_m * math.sin(yaw_rad), down
+
+    def goals(self, context: BehaviourContext) -> tuple[Vector3, ...]:
+        """The circle, if its centre is known: see Behaviour."""
+        if self.subject is not None:
+            return ()
+        north, east, down = self._point_ahead(context)
+        angles = (math.tau * step / _CHECKED_POINTS for step in range(_CHECKED_POINTS))
+        return tuple(
+            (north + self._radius_m * math.cos(angle), east + self._radius_m * math.sin(angle), down)
+            for angle in angles
+        )
+
     def on_activate(self, context: BehaviourContext) -> None:
-        position, yaw_rad = position_and_yaw(context.state)
+        position, _ = position_and_yaw(context.state)
         self._begin(position[2])
         if self.subject is None:
-            self._centre = (
-                position[0] + self._radius_m * math.cos(yaw_rad),
-                position[1] + self._radius_m * math.sin(yaw_rad),
-                position[2],
-            )
+            self._centre = self._point_ahead(context)
         else:
             context.objects.forget(self.subject)
 

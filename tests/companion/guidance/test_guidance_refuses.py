@@ -99,6 +99,7 @@ BOX = Fence(((-20.0, -20.0), (20.0, -20.0), (20.0, 20.0), (-20.0, 20.0)))
         (FollowPathBehaviour([(0.0, 0.0), (0.0, -7000.0)], 3.0), ["-7000.0 m east"]),
         ("patrol 0,0;4000,0 classes=car", ["4000.0 m north"]),
         (FigureEightBehaviour(6000.0, 3.0, 1.0), ["guidance.max_distance_m"]),
+        ("orbit radius=30", ["m north", "fence_include"]),
         ("seek car pattern=lawnmower width=900 height=20 spacing=9", ["guidance.max_distance_m"]),
         ("goto 0 0 altitude=90", ["guidance.max_altitude_m = 50"]),
         (FollowPathBehaviour([(0.0, 0.0), (5.0, 0.0, 0.2)], 3.0), ["guidance.min_altitude_m = 1"]),

@@ -7,6 +7,7 @@ import pytest
 from companion.guidance.behaviour import Behaviour, BehaviourContext, BehaviourOutput
 from companion.guidance.behaviours.hold import HoldBehaviour
 from companion.guidance.behaviours.orbit import Orbit, OrbitBehaviour
+from companion.guidance.limits.envelope import Limits
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3
 from tests.companion.guidance.guidance_harness import Flight, assert_failed, assert_succeeded
@@ -102,6 +103,18 @@ def test_orbit_reaches_a_distant_circle() -> None:
     flight.latency_s = 0.0
     assert_succeeded(flight.run(90.0))
     assert math.dist(vehicle.position[:2], (30.0, 4.0)) == pytest.approx(8.0, abs=0.6)
+
+
+def test_orbit_whose_circle_leaves_the_limits_ends_by_its_time() -> None:
+    flight = Flight(
+        "orbit car radius=8 speed=3 laps=1",
+        KinematicVehicle(),
+        [SeenObject("car", 30.0, 4.0)],
+        limits=Limits(max_distance_m=30.0),
+    )
+    flight.latency_s = 0.0
+    assert_failed(flight.run(120.0), "timed out")
+    assert max(math.hypot(*position[:2]) for position in flight.track) < 30.5
 
 
 def test_orbit_without_a_visible_object_ends() -> None:
