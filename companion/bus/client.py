@@ -225,6 +225,10 @@ class LastStatus:
             self._newest = str(status["vehicle"]["without_service"]), time.monotonic()
 
 
+def _nothing() -> None:
+    """Do nothing."""
+
+
 def send_command(
     session: zenoh.Session,
     vehicle: str,
@@ -232,11 +236,13 @@ def send_command(
     *,
     timeout_s: float = 120.0,
     on_silent: Callable[[str], None] = logger.warning,
+    on_sent: Callable[[], object] = _nothing,
 ) -> dict[str, Any]:
     """Send one command and wait for its result: {"success": bool, "reason": str, ...}.
 
     Args:
         on_silent: called once, with a sentence, if the service is there and silent meanwhile.
+        on_sent: called once the command is sent: what is sent by this session from now on arrives after it.
 
     Raises:
         NoAnswerError: no service for this vehicle, it has gone meanwhile, or no answer within `timeout_s`.
@@ -259,6 +265,7 @@ def send_command(
         # The service limits the rate of each sender.
         sender = str(session.zid())
         session.get(command_key(vehicle), replies, payload=text, attachment=sender, timeout=timeout_s)
+        on_sent()
         return _answer(received, vehicle, text, timeout_s, deadline_s, status, on_silent)
     finally:
         status.close()
@@ -266,18 +273,25 @@ def send_command(
 
 
 def set_settings(
-    session: zenoh.Session, vehicle: str, values: dict[str, Any] | None = None, *, timeout_s: float = 5.0
+    session: zenoh.Session,
+    vehicle: str,
+    values: dict[str, Any] | None = None,
+    *,
+    timeout_s: float = 5.0,
+    on_sent: Callable[[], object] = _nothing,
 ) -> dict[str, Any]:
     """Change settings of a running service, all or none; returns key → `LiveSettingBody` of all that can be.
 
     Args:
-        values: key → value; None: change none.
+        values: key → value; None: change none. on_sent: as of `send_command`.
 
     Raises:
         SettingsRefusedError: by the service. NoAnswerError: no answer. PeerDataError: it cannot be used.
     """
     payload = None if values is None else json.dumps(values)
-    for reply in session.get(settings_key(vehicle), payload=payload, timeout=timeout_s):
+    replies = session.get(settings_key(vehicle), payload=payload, timeout=timeout_s)
+    on_sent()
+    for reply in replies:
         if reply.ok is not None:
             return parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES))
         if reply.err is not None:

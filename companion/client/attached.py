@@ -67,20 +67,43 @@ async def in_thread(function: Callable[[], T]) -> T:
 
 
 def attached_target(session: zenoh.Session, vehicle: str, say: Callable[[str], None]) -> Target:
-    """Return how a console reaches a service.
+    """Return how a console reaches a service. Commands and settings are sent in the order of their calls.
 
     Args:
         say: gets a sentence, from any thread, if the service is silent while a command waits.
     """
+    order = asyncio.Lock()  # first in, first out
+
+    async def in_order(send: Callable[[Callable[[], None]], T]) -> T:
+        """Send after what was called before was sent: of two lines that come at once, the last one counts."""
+        loop, sent = asyncio.get_running_loop(), asyncio.Event()
+
+        def on_sent() -> None:
+            with suppress(RuntimeError):  # the loop is closed
+                loop.call_soon_threadsafe(sent.set)
+
+        async with order:
+            answer = asyncio.ensure_future(in_thread(lambda: send(on_sent)))
+            answer.add_done_callback(lambda _: sent.set())
+            try:
+                await sent.wait()
+            except asyncio.CancelledError:
+                answer.cancel()
+                raise
+        return await answer
 
     async def command(text: str) -> Mapping[str, Any]:
-        return await in_thread(
-            lambda: send_command(session, vehicle, text, timeout_s=_COMMAND_TIMEOUT_S, on_silent=say)
+        return await in_order(
+            lambda on_sent: send_command(
+                session, vehicle, text, timeout_s=_COMMAND_TIMEOUT_S, on_silent=say, on_sent=on_sent
+            )
         )
 
     async def settings(payload: bytes) -> Mapping[str, Any]:
         values = parse_object(payload) if payload else None
-        return await in_thread(lambda: set_settings(session, vehicle, values, timeout_s=_QUERY_S))
+        return await in_order(
+            lambda on_sent: set_settings(session, vehicle, values, timeout_s=_QUERY_S, on_sent=on_sent)
+        )
 
     def query(path: str) -> dict[str, Any]:
         for reply in session.get(f"{topics.ROOT}/{vehicle}/{path}", timeout=_QUERY_S):
