@@ -40,7 +40,7 @@ class TextFile:
 
     def found(self) -> str | None:
         """Return what is there; None: nothing."""
-        return self.path.read_text(errors="replace") if self.path.is_file() else None
+        return self.path.read_text("utf-8", "surrogateescape") if self.path.is_file() else None
 
     def is_there(self) -> bool:
         """Whether it is there with this text."""
@@ -50,9 +50,13 @@ class TextFile:
         """Write it whole, or not at all; all may read it."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         new = self.path.with_name(f".{self.path.name}.new")
-        new.write_text(self.text)
-        new.chmod(0o644)
-        new.replace(self.path)
+        try:
+            # A path of another encoding, in the user's unit, stays as it is.
+            new.write_text(self.text, "utf-8", "surrogateescape")
+            new.chmod(0o644)
+            new.replace(self.path)
+        finally:
+            new.unlink(missing_ok=True)
 
     def lines(self) -> Iterator[str]:
         """Yield the text if it is new, else what changes, as a unified diff."""
@@ -84,7 +88,10 @@ class Link:
         new = self.path.with_name(f".{self.path.name}.new")
         new.unlink(missing_ok=True)
         new.symlink_to(self.target)
-        new.replace(self.path)
+        try:
+            new.replace(self.path)
+        finally:
+            new.unlink(missing_ok=True)
 
     def lines(self) -> Iterator[str]:
         """Yield where it leads, before and after."""

@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,8 +26,8 @@ from companion.setup.files import (
     user_entries,
 )
 from companion.setup.flight import check_not_flying, settings_of_unit
-from companion.setup.startup import wait_until_up
-from companion.setup.systemctl import Host, SetupError
+from companion.setup.startup import starts_at_boot, wait_until_up
+from companion.setup.systemctl import Host, SetupError, as_root
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 
 GROUPS = ("dialout", "video")
@@ -67,19 +67,37 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
         _say_entry(entry, say, whole=dry_run)
         if not dry_run and entry in changed:
             entry.write()
-    commands = [*_preparing(host), *_freeing(host, settings, say), *_starting(host, bool(changed))]
-    before, began_s = None if dry_run else host.show(UNIT).get("InvocationID"), time.time()
+    instances = [] if host.user else host.instances()
+    # Who runs instances alone has disabled the first one.
+    starts = not instances or host.show(UNIT).get("UnitFileState") == "enabled"
+    watched = [UNIT] if starts else []
+    watched += [unit for unit in instances if changed and host.is_active(unit)]
+    commands = [*_preparing(host), *_freeing(host, settings, say)]
+    commands += _starting(host, instances, starts=starts, changed=bool(changed))
+    before = {} if dry_run else {unit: host.show(unit).get("InvocationID") for unit in watched}
+    began_s = time.time()
     for command in commands:
         say(f"run        {shlex.join(command)}")
         if not dry_run:
             host.run(command)
     if host.user:
-        for line in _advice_of_user():
+        for line in _advice_of_user(host):
             say(line)
     if dry_run:
         say("nothing was changed: --dry-run")
         return True
-    return wait_until_up(host, settings, say, before if changed else None, began_s)
+    up = True
+    for unit in watched:
+        replaced = before[unit] if changed else None
+        up = wait_until_up(host, unit, _settings_of(host, unit), say, replaced, began_s) and up
+    return up
+
+
+def _settings_of(host: Host, unit: str) -> Settings | None:
+    try:
+        return settings_of_unit(host, unit)
+    except (ConfigurationError, OSError):
+        return None
 
 
 def _check_place(environment: Path, python: Path) -> None:
@@ -89,13 +107,15 @@ def _check_place(environment: Path, python: Path) -> None:
         f"sudo /usr/bin/python3 -m venv {here}\nsudo {here}/bin/pip install mavlink-companion\n"
         f"sudo {here}/bin/companion install\nor, for this user alone: companion install --user"
     )
-    if environment.parent != INSTALLATIONS or environment == CURRENT:
+    # /opt may be a link to a larger disk.
+    if environment.parent != INSTALLATIONS.resolve() or environment.name == CURRENT.name:
         raise SetupError(
             f"this environment is {environment}; a service of the system needs one of root's in "
             f"{INSTALLATIONS}:\n{how}"
         )
-    if any(python.is_relative_to(hidden) for hidden in _HIDDEN):
-        raise SetupError(f"the Python of {environment} is {python}, which the service cannot see:\n{how}")
+    for what, path in (("environment", environment), (f"Python of {environment}", python)):
+        if any(path.is_relative_to(hidden) for hidden in _HIDDEN):
+            raise SetupError(f"the {what} is {path}, which the service cannot see:\n{how}")
 
 
 def _check_possible(host: Host) -> None:
@@ -106,7 +126,7 @@ def _check_possible(host: Host) -> None:
         if "active" in host.run(("systemctl", "show", UNIT, "--property=ActiveState")).split("="):
             raise SetupError(f"{UNIT} of the system runs already: sudo companion uninstall removes it")
     elif os.geteuid() != 0:
-        raise SetupError(f"this needs root: sudo {sys.argv[0]} install; or companion install --user")
+        raise SetupError(f"this needs root: {as_root('install')}; or companion install --user")
 
 
 def _settings(host: Host, say: Say) -> Settings | None:
@@ -183,10 +203,10 @@ def terminals(host: Host, settings: Settings) -> list[str]:
     return [f"serial-getty@{device.name}.service", *jetson]
 
 
-def _starting(host: Host, changed: bool) -> Iterator[tuple[str, ...]]:
-    # Who runs instances alone has disabled the first one.
-    instances = [] if host.user else host.instances()
-    if not instances or host.show(UNIT).get("UnitFileState") == "enabled":
+def _starting(
+    host: Host, instances: Sequence[str], *, starts: bool, changed: bool
+) -> Iterator[tuple[str, ...]]:
+    if starts:
         yield host.systemctl("enable", UNIT)
         # A start may take minutes, for a model that is converted: it is watched.
         yield host.systemctl("--no-block", "restart" if changed else "start", UNIT)
@@ -194,11 +214,11 @@ def _starting(host: Host, changed: bool) -> Iterator[tuple[str, ...]]:
         yield host.systemctl("--no-block", "try-restart", *instances)
 
 
-def _advice_of_user() -> Iterator[str]:
+def _advice_of_user(host: Host) -> Iterator[str]:
     """Yield what only root can do for a service of this user."""
     user = user_of_service()
     names = {group_name(gid) for gid in user.groups | user.new_groups}
     if missing := [group for group in GROUPS if group not in names and user.uid]:
         yield f"advice     serial line and camera: sudo usermod -aG {','.join(missing)} {user.name}"
-    if not (Path("/var/lib/systemd/linger") / user.name).exists():
+    if not starts_at_boot(host):
         yield f"advice     to start at boot, without a login: sudo loginctl enable-linger {user.name}"

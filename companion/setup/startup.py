@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 from companion.bus.bodies.service import StatusBody
 from companion.doctor.check import worst_first
-from companion.doctor.facts import Facts, Machine, checks_of
+from companion.doctor.facts import Facts, Machine, checks_of, user_of_service
 from companion.doctor.running import CHECKS
 from companion.doctor.screens import status_lines
 from companion.doctor.service_query import find_service
 from companion.settings import Settings
-from companion.setup.files import UNIT
 from companion.setup.systemctl import Host
 
 START_S = 120.0
@@ -23,12 +23,23 @@ _JOURNAL_LINES = 15
 _WIDTH = 80
 _UP = ("ready", "finished")
 _AUTOPILOT = "autopilot"
+_EXITED = "1"  # CLD_EXITED; otherwise a signal has ended it
+
+
+def starts_at_boot(host: Host) -> bool:
+    """Whether an enabled service starts with the computer, and not with the user's login: loginctl(1)."""
+    return not host.user or (Path("/var/lib/systemd/linger") / user_of_service().name).exists()
 
 
 def wait_until_up(
-    host: Host, settings: Settings | None, say: Callable[[str], None], before: str | None, began_s: float
+    host: Host,
+    unit: str,
+    settings: Settings | None,
+    say: Callable[[str], None],
+    before: str | None,
+    began_s: float,
 ) -> bool:
-    """Wait until the service is ready, for two minutes at most, and print its state.
+    """Wait until a service is ready, for two minutes at most, and print its state.
 
     Args:
         settings: of the service; None: they are wrong, and it will end.
@@ -38,28 +49,29 @@ def wait_until_up(
     Returns:
         Whether it is ready, or waits for nothing but the autopilot.
     """
-    if (why := _wait_for_systemd(host, say, before)) is not None:
-        say(f"not up     {UNIT} {why}; its log:")
-        for line in host.journal(UNIT, began_s, _JOURNAL_LINES).splitlines():
+    if (why := _wait_for_systemd(host, unit, say, before)) is not None:
+        say(f"not up     {unit} {why}; its log:")
+        for line in host.journal(unit, began_s, _JOURNAL_LINES).splitlines():
             say(f"    {line}")
         return False
     if settings is None:
         settings = Settings()
-    return _say_status(host, settings, say, began_s)
+    return _say_status(host, unit, settings, say, began_s)
 
 
-def _wait_for_systemd(host: Host, say: Callable[[str], None], before: str | None) -> str | None:
+def _wait_for_systemd(host: Host, unit: str, say: Callable[[str], None], before: str | None) -> str | None:
     """Return why the unit is not active; None: it is."""
     start_s, said_s, text = time.monotonic(), 0.0, ""
     while True:
-        state = host.show(UNIT)
+        state = host.show(unit)
         active, waited_s = state.get("ActiveState"), time.monotonic() - start_s
         replaced = before is None or state.get("InvocationID") != before
         if active == "active" and replaced:
             return None
         restarted = state.get("SubState") == "auto-restart" or state.get("NRestarts") not in (None, "", "0")
         if replaced and (active == "failed" or restarted):
-            return f"has ended with exit code {state.get('ExecMainStatus')}"
+            by = "with exit code" if state.get("ExecMainCode") in (None, _EXITED) else "by signal"
+            return f"has ended {by} {state.get('ExecMainStatus')}"
         if waited_s > START_S:
             return f"is still {active}: companion status shows when it is ready"
         if state.get("StatusText", "") != text or waited_s - said_s > _SAID_EVERY_S:
@@ -68,7 +80,9 @@ def _wait_for_systemd(host: Host, say: Callable[[str], None], before: str | None
         time.sleep(_POLL_S)
 
 
-def _say_status(host: Host, settings: Settings, say: Callable[[str], None], began_s: float) -> bool:
+def _say_status(
+    host: Host, unit: str, settings: Settings, say: Callable[[str], None], began_s: float
+) -> bool:
     """Print the screen of `companion status`, once every part has come up or failed."""
     start_s = time.monotonic()
     while True:
@@ -82,20 +96,21 @@ def _say_status(host: Host, settings: Settings, say: Callable[[str], None], bega
         say(f"waiting    {waited_s:.0f} s: {', '.join(starting) or 'its first status'}")
         time.sleep(_POLL_S)
     if service is None or status is None:
-        say(f"not up     {UNIT} runs, and does not answer: companion doctor")
+        say(f"not up     {unit} runs, and does not answer: companion doctor")
         return False
     facts = Facts(found.settings or settings, Machine(), service)
     for line in status_lines(facts, worst_first(checks_of(facts, CHECKS)), _WIDTH):
         say(line)
     if status["healthy"]:
-        say(f"ready      {UNIT} runs, and starts with this computer")
+        when = "with this computer" if starts_at_boot(host) else "when you log in"
+        say(f"ready      {unit} runs, and starts {when}")
         return True
     missing = _missing(status)
     if all(name == _AUTOPILOT for name in missing):
-        say(f"ready      {UNIT} runs, and waits for the autopilot")
+        say(f"ready      {unit} runs, and waits for the autopilot")
         return True
     say(f"not ready  {', '.join(missing)}; companion doctor finds out why. Warnings of its log:")
-    for line in host.journal(UNIT, began_s, _JOURNAL_LINES).splitlines():
+    for line in host.journal(unit, began_s, _JOURNAL_LINES).splitlines():
         say(f"    {line}")
     return False
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +13,7 @@ from companion.setup.files import SYSTEM_UNITS, UNIT, below
 
 _INSTANCES = "companion@*.service"
 _LONGEST_S = 90.0  # of a stop: TimeoutStopSec of the unit, and a margin
+_NO_MANAGER = "; systemd has a manager for users that are logged in: log in as this user, not by su or sudo"
 
 
 class SetupError(Exception):
@@ -20,15 +23,31 @@ class SetupError(Exception):
 def run_program(command: Sequence[str]) -> str:
     """Run a program and return what it prints. Raises SetupError with its last line."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_LONGEST_S, check=False)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",  # of a journal
+            timeout=_LONGEST_S,
+            check=False,
+        )
     except FileNotFoundError as error:
         raise SetupError(f"{command[0]}: no such program; this needs a Linux with systemd") from error
     except subprocess.TimeoutExpired as error:
         raise SetupError(f"{' '.join(command)}: no end yet, given up") from error
     if done.returncode:
         said = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
-        raise SetupError(f"{' '.join(command)}: {said[-1]}")
+        advice = _NO_MANAGER if "--user" in command and "connect to bus" in said[-1] else ""
+        raise SetupError(f"{' '.join(command)}: {said[-1]}{advice}")
     return done.stdout
+
+
+def as_root(word: str) -> str:
+    """Return the line that runs a command of this program as root. `word`: its name."""
+    program = sys.argv[0]
+    # `python -m companion.cli`: its first word is a file that is no program.
+    words = (sys.executable, "-m", "companion.cli") if program.endswith("__main__.py") else (program,)
+    return shlex.join(("sudo", *words, word))
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +82,14 @@ class Host:
     def journal(self, unit: str, since_s: float, lines: int) -> str:
         """Return the newest lines of a unit since a time of day, seconds since 1970."""
         of_unit = "--user-unit" if self.user else "--unit"
-        options = (f"--since=@{since_s:.0f}", f"--lines={lines}", "--no-pager", "--output=cat")
+        options = (f"--since=@{int(since_s)}", f"--lines={lines}", "--no-pager", "--output=cat")
         return self.run(("journalctl", of_unit, unit, *options))
 
     def show(self, unit: str) -> Mapping[str, str]:
         """Return the state of a unit, as `systemctl show` names it; of one that is not there too."""
         names = ("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID")
-        printed = self.run(self.systemctl("show", unit, f"--property={','.join((*names, 'ExecMainStatus'))}"))
+        names += ("ExecMainCode", "ExecMainStatus")
+        printed = self.run(self.systemctl("show", unit, f"--property={','.join(names)}"))
         return dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
 
     def instances(self) -> list[str]:

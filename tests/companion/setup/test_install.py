@@ -19,11 +19,14 @@ from companion.setup.files import (
     SYSTEM_UNITS,
     TEMPLATE,
     UNIT,
+    Link,
+    TextFile,
     packaged,
     system_entries,
     user_unit,
 )
-from companion.setup.systemctl import Host, SetupError
+from companion.setup.startup import wait_until_up
+from companion.setup.systemctl import Host, SetupError, run_program
 from tests.companion.doctor.computer import service
 
 OLD, NEW = INSTALLATIONS / "1.0", INSTALLATIONS / "1.1"
@@ -191,6 +194,68 @@ def test_environment_that_the_service_cannot_use_is_named(
     assert computer.files() == before
 
 
+def test_opt_may_be_a_link(computer: Computer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (disk := tmp_path / "disk/companion").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(disk)
+    monkeypatch.setattr(install, "INSTALLATIONS", tmp_path / "link")
+    computer.version(tmp_path / "link/1.0")
+    computer.install()
+    assert (computer.root / CURRENT.relative_to("/")).readlink() == disk / "1.0"
+
+
+def test_of_instances_alone_only_these_are_waited_for(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waited: list[str] = []
+    monkeypatch.setattr(install, "wait_until_up", lambda _, unit, *__: bool(waited.append(unit)) or True)
+    monkeypatch.setattr(flight, "find_service", lambda *_: Found(service({"vehicle.armed": False})))
+    wants = computer.root / "etc/systemd/system/multi-user.target.wants"
+    wants.mkdir(parents=True)
+    for name in ("north", "south"):
+        (wants / f"companion@{name}.service").touch()
+        (computer.root / f"etc/companion/{name}.toml").touch()
+    computer.states["companion@north.service"] = "ActiveState=active\nUnitFileState=enabled"
+    computer.states[UNIT] = "ActiveState=inactive\nUnitFileState=disabled"
+    computer.install()
+    assert waited == ["companion@north.service"]
+    assert not computer.ran("systemctl", "enable", UNIT)
+
+
+@pytest.mark.parametrize(
+    ("program", "line"),
+    [
+        ("/opt/companion/1 0/bin/companion", "sudo '/opt/companion/1 0/bin/companion' install"),
+        ("/usr/lib/python3/companion/cli/__main__.py", "sudo /usr/bin/python3 -m companion.cli install"),
+    ],
+)
+def test_line_for_root_can_be_copied(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, program: str, line: str
+) -> None:
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    monkeypatch.setattr(sys, "argv", [program])
+    with pytest.raises(SetupError) as raised:
+        computer.install()
+    assert line in str(raised.value)
+
+
+def test_output_of_a_program_may_be_any_bytes() -> None:
+    assert run_program(("printf", r"\303\274\377")) == "ü\ufffd"
+
+
+def test_log_of_a_start_begins_before_it() -> None:
+    commands: list[Sequence[str]] = []
+    Host(run=lambda words: str(commands.append(words))).journal(UNIT, 100.9, 5)
+    assert "--since=@100" in commands[0]
+
+
+@pytest.mark.parametrize("code", [1, 2])
+def test_end_by_a_signal_is_no_exit_code(code: int) -> None:
+    state = f"ActiveState=failed\nExecMainCode={code}\nExecMainStatus=9"
+    said: list[str] = []
+    assert not wait_until_up(Host(run=lambda _: state), UNIT, None, said.append, None, 0.0)
+    assert ("signal 9" in said[0], "exit code 9" in said[0]) == (code == 2, code == 1)
+
+
 @pytest.mark.parametrize("missing", ["root", "systemd"])
 def test_install_needs_root_and_systemd(
     computer: Computer, monkeypatch: pytest.MonkeyPatch, missing: str
@@ -298,6 +363,18 @@ def test_unit_of_a_user_asks_for_no_privileges() -> None:
     assert 'ExecStart="/home/a b/100%%/bin/python" -m companion.cli run' in lines
     assert "WantedBy=default.target" in lines
     assert "WantedBy=multi-user.target" not in lines
+
+
+def test_files_are_written_whole_whatever_their_text_is(tmp_path: Path) -> None:
+    file = TextFile(tmp_path / UNIT, user_unit(Path("/home/jürgen/\udcfc/bin/python")))
+    file.write()
+    assert file.is_there()
+    assert b"/home/j\xc3\xbcrgen/\xfc/bin" in file.path.read_bytes()
+    for entry in (TextFile(tmp_path / "folder", ""), Link(tmp_path / "folder", tmp_path)):
+        (tmp_path / "folder").mkdir(exist_ok=True)
+        with pytest.raises(OSError, match="folder"):
+            entry.write()
+    assert sorted(each.name for each in tmp_path.iterdir()) == [UNIT, "folder"]
 
 
 @pytest.mark.needs("systemd-analyze")
