@@ -35,7 +35,10 @@ def install(user: User = False, dry_run: DryRun = False, force: Force = False) -
 def uninstall(
     user: User = False,
     purge: Annotated[
-        bool, typer.Option("--purge", help="Also settings, recordings, models, and the user companion.")
+        bool,
+        typer.Option(
+            "--purge", help="Also the system's settings, recordings, models, and the user companion."
+        ),
     ] = False,
     dry_run: DryRun = False,
     force: Force = False,

@@ -10,11 +10,13 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from companion.settings.layers import SYSTEM_FILE
+from companion.host.state_folder import state_folder
+from companion.settings.layers import SYSTEM_FILE, user_file
 from companion.settings.reading import ConfigurationError
 from companion.setup.files import (
     INSTALLATIONS,
     RULES,
+    SYSTEM_UNITS,
     SYSUSERS,
     UNIT,
     Entry,
@@ -25,7 +27,7 @@ from companion.setup.files import (
 )
 from companion.setup.flight import check_not_flying, settings_of_unit
 from companion.setup.install import terminals
-from companion.setup.systemctl import Host, SetupError
+from companion.setup.systemctl import Host, SetupError, as_root
 
 USER = "companion"
 STATE, CACHE = Path("/var/lib/companion"), Path("/var/cache/companion")
@@ -44,15 +46,20 @@ def uninstall(
     """Stop the service and remove its files.
 
     Args:
-        say: prints a line. purge: also settings, recordings, models, caches, and the user `companion`.
+        say: prints a line. purge: also settings, recordings, models, caches, and the user `companion`, of a
+            service of the system.
         dry_run: print what would be done, and change nothing. force: also while the vehicle is armed.
 
     Raises:
         SetupError: it cannot be removed now, or by this user.
     """
+    if purge and host.user:
+        raise SetupError(
+            "--purge is for the service of the system; without it the lines for yours are printed"
+        )
     if not dry_run:
         if not host.user and os.geteuid() != 0:
-            raise SetupError(f"this needs root: sudo {sys.argv[0]} uninstall")
+            raise SetupError(f"this needs root: {as_root('uninstall')}")
         host.check_manager()
         if not force:
             check_not_flying(host)
@@ -94,9 +101,7 @@ def uninstall(
     for folder in folders:
         if folder.is_dir() and not any(folder.iterdir()):
             remove(folder)
-    if host.user:
-        return
-    for line in _kept(host, disabled, purge=purge):
+    for line in _kept_of_user() if host.user else _kept(host, disabled, purge=purge):
         say(line)
 
 
@@ -122,20 +127,32 @@ def _kept(host: Host, disabled: list[str], *, purge: bool) -> Iterator[str]:
         users = [f"user {USER}"] if _has_user() else []
         if kept := [*there, *users]:
             yield f"kept       {', '.join(kept)}: uninstall --purge removes them"
-    drop_ins = below(host.root, Path("/etc/systemd/system")).glob("companion*.service.d")
-    for folder in drop_ins:
-        yield f"kept       {folder}: your own changes of the unit"
+    for folder in below(host.root, SYSTEM_UNITS).glob("companion*.service.d"):
+        yield f"kept       {folder}: your own changes of the unit: {_removing('sudo', folder)}"
     environments = below(host.root, INSTALLATIONS)
     if environments.is_dir():
         for folder in sorted(environments.iterdir()):
-            yield f"kept       {folder}: sudo rm -r {folder}"
+            yield f"kept       {folder}: {_removing('sudo', folder)}"
     for unit in disabled:
         yield f"kept       {unit} is disabled: sudo systemctl enable --now {unit}"
 
 
+def _kept_of_user() -> Iterator[str]:
+    for what, folder in (("settings", user_file().parent), ("state", state_folder())):
+        if folder.is_dir():
+            yield f"kept       {folder}: {what}: {_removing(folder)}"
+    for folder in user_units().glob("companion*.service.d"):
+        yield f"kept       {folder}: your own changes of the unit: {_removing(folder)}"
+
+
+def _removing(*words: str | Path) -> str:
+    *before, folder = map(str, words)
+    return shlex.join((*before, "rm", "-r", folder))
+
+
 def _has_user() -> bool:
+    """Whether there is the user that sysusers.d(5) has made, and no person's of that name."""
     try:
-        pwd.getpwnam(USER)
+        return pwd.getpwnam(USER).pw_dir == str(STATE)
     except KeyError:
         return False
-    return True

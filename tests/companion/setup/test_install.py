@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -23,6 +25,7 @@ from companion.setup.files import (
     TextFile,
     packaged,
     system_entries,
+    user_entries,
     user_unit,
 )
 from companion.setup.startup import wait_until_up
@@ -51,7 +54,9 @@ class Computer:
         monkeypatch.setattr("os.geteuid", lambda: 0)
         monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
         monkeypatch.setattr(install, "wait_until_up", lambda *_: True)
-        monkeypatch.setattr(uninstall, "_has_user", lambda: True)
+        self.home = "/var/lib/companion"
+        users = SimpleNamespace(getpwnam=lambda _: SimpleNamespace(pw_dir=self.home))
+        monkeypatch.setattr(uninstall, "pwd", users)
         self.version(OLD)
 
     def version(self, environment: Path) -> None:
@@ -332,6 +337,40 @@ def test_purge_removes_settings_recordings_and_user(computer: Computer) -> None:
     for folder in ("etc/companion", "var/lib/companion", "var/cache/companion"):
         assert not (computer.root / folder).exists()
     assert computer.ran("userdel", "companion")
+
+
+def test_purge_leaves_the_user_of_a_person(computer: Computer) -> None:
+    computer.install()
+    computer.home = "/home/companion"
+    computer.uninstall(purge=True)
+    assert not any(words[0] == "userdel" for words in computer.commands)
+    assert not any("user companion" in line for line in computer.said)
+
+
+def test_line_that_removes_an_environment_is_quoted(computer: Computer) -> None:
+    computer.install()
+    (computer.root / "opt/companion/1.0 alt").mkdir()
+    computer.uninstall()
+    (line,) = [line for line in computer.said if "1.0 alt" in line]
+    assert shlex.split(line.partition(": ")[2])[3:] == [str(computer.root / "opt/companion/1.0 alt")]
+
+
+def test_uninstall_of_a_user_names_what_it_keeps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    said: list[str] = []
+    host = Host(user=True, root=tmp_path, run=lambda _: "ActiveState=inactive")
+    kept = [tmp_path / name for name in ("config/companion", "state/companion")]
+    for folder in kept:
+        folder.mkdir(parents=True)
+    for entry in user_entries():
+        entry.write()
+    uninstall.uninstall(host, said.append)
+    assert not (tmp_path / "config/systemd").exists()
+    assert all(folder.is_dir() and any(f"rm -r {folder}" in line for line in said) for folder in kept)
+    with pytest.raises(SetupError, match="--purge"):
+        uninstall.uninstall(host, said.append, purge=True)
 
 
 def test_uninstall_names_what_it_does_not_change_back(computer: Computer) -> None:
