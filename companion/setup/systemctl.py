@@ -87,8 +87,10 @@ class Host:
 
     def show(self, unit: str) -> Mapping[str, str]:
         """Return the state of a unit, as `systemctl show` names it; of one that is not there too."""
-        names = ("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID")
-        names += ("ExecMainCode", "ExecMainStatus")
+        names = (
+            *("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID"),
+            *("ExecMainCode", "ExecMainStatus"),
+        )
         printed = self.run(self.systemctl("show", unit, f"--property={','.join(names)}"))
         return dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
 

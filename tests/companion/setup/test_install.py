@@ -212,7 +212,12 @@ def test_of_instances_alone_only_these_are_waited_for(
     computer: Computer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     waited: list[str] = []
-    monkeypatch.setattr(install, "wait_until_up", lambda _, unit, *__: bool(waited.append(unit)) or True)
+
+    def wait(_: Host, unit: str, *__: object) -> bool:
+        waited.append(unit)
+        return True
+
+    monkeypatch.setattr(install, "wait_until_up", wait)
     monkeypatch.setattr(flight, "find_service", lambda *_: Found(service({"vehicle.armed": False})))
     wants = computer.root / "etc/systemd/system/multi-user.target.wants"
     wants.mkdir(parents=True)
@@ -249,7 +254,12 @@ def test_output_of_a_program_may_be_any_bytes() -> None:
 
 def test_log_of_a_start_begins_before_it() -> None:
     commands: list[Sequence[str]] = []
-    Host(run=lambda words: str(commands.append(words))).journal(UNIT, 100.9, 5)
+
+    def run(words: Sequence[str]) -> str:
+        commands.append(words)
+        return ""
+
+    Host(run=run).journal(UNIT, 100.9, 5)
     assert "--since=@100" in commands[0]
 
 
