@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import CLIENT_SETTINGS, EXIT_FAILED, named_vehicle, plain_errors, say_vehicle
+from companion.cli.flags import (
+    CLIENT_SETTINGS,
+    EXIT_FAILED,
+    is_terminal,
+    named_vehicle,
+    plain_errors,
+    say_vehicle,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -126,7 +133,7 @@ class Terminal:
             self.show("not executed: nobody confirms it; language.may lists what needs no confirmation")
             return False
         # A console of the service prints whole lines only.
-        (self.write if sys.stdin.isatty() else self.show)("fly this? [y/N] ")
+        (self.write if is_terminal(sys.stdin) else self.show)("fly this? [y/N] ")
         self._asked = asyncio.get_running_loop().create_future()
         try:
             return await self._asked
@@ -149,7 +156,7 @@ class Terminal:
 
         self._read_in_thread()
         chat = sentence is None
-        if chat and sys.stdin.isatty():
+        if chat and is_terminal(sys.stdin):
             self.show(_BANNER)
         beginning = asyncio.ensure_future(begin())
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import plain_errors, say_silent, vehicle_of
+from companion.cli.flags import is_terminal, plain_errors, refuse, say_silent, vehicle_of
 
 if TYPE_CHECKING:
     import zenoh
@@ -47,7 +47,9 @@ def console(settings: Settings, python: Python = False) -> None:
         if python:
             asyncio.run(_prompt_python(session, vehicle))
             return
-        if not sys.stdin.isatty():
+        if sys.stdin is None:
+            refuse("standard input is closed, and gives no commands: companion send has one as its argument")
+        if not is_terminal(sys.stdin):
             raise typer.Exit(_answer_lines(session, vehicle))
         with plain_errors(OSError):
             asyncio.run(_attend(session, vehicle, settings))
@@ -91,7 +93,7 @@ async def _attend(session: zenoh.Session, vehicle: str, settings: Settings) -> N
     from companion.operator.line_output import LineOutput, use_for_standard_error
 
     # What is logged stands above the typed line too.
-    standard_error = use_for_standard_error() if sys.stderr.isatty() else None
+    standard_error = use_for_standard_error() if is_terminal(sys.stderr) else None
     output = standard_error or LineOutput(sys.stdout.fileno())
     own = settings.vehicle.model_copy(update={"name": vehicle})
     ask = AskProcess(settings.model_copy(update={"vehicle": own}))

@@ -17,6 +17,7 @@ from companion.cli.flags import (
     Processes,
     RayAddress,
     check_seed_options,
+    is_terminal,
     plain_errors,
 )
 from companion.host.journal import log_to_standard_error
@@ -118,6 +119,6 @@ def _fly_seeds(text: str, processes: int, ray: str | None, *, synthetic: bool, a
     if as_json:
         typer.echo(json.dumps(demos_summary(flights)))
     else:
-        Console(width=None if sys.stdout.isatty() else 160).print(demos_table(flights))
+        Console(width=None if is_terminal(sys.stdout) else 160).print(demos_table(flights))
     if not all(flight.success for flight in flights):
         raise typer.Exit(EXIT_FAILED)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import AsJson, check_belonging, plain_errors, refuse
+from companion.cli.flags import AsJson, check_belonging, is_terminal, plain_errors, refuse
 from companion.host.journal import marked_for_journal
 from vision.redaction import HIDDEN, redacted
 
@@ -120,7 +120,7 @@ def _describe_topics(schema: Path | None, *, as_json: bool, as_markdown: bool) -
     table = Table(*COLUMNS)
     for cells in topic_rows():
         table.add_row(*cells)
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    Console(width=None if is_terminal(sys.stdout) else 160).print(table)
 
 
 def _describe_settings(layered: LayeredSettings, *, check: bool) -> None:

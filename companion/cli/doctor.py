@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, AsJson, named_vehicle, plain_errors, vehicle_of
+from companion.cli.flags import EXIT_FAILED, AsJson, is_terminal, named_vehicle, plain_errors, vehicle_of
 from vision.redaction import redacted
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def status(
                 lines = list(_screen(service, own))
                 if (silent_s := watched.silent_s) is None or silent_s > SILENT_S:
                     lines.insert(0, f"error    no status for {silent_s or 0:.0f} s: what follows is old")
-                if sys.stdout.isatty():
+                if is_terminal(sys.stdout):
                     typer.echo(_CLEAR, nl=False)
                 _print(lines)
         except KeyboardInterrupt:
@@ -108,12 +108,12 @@ def _screen(service: Service, own: Settings | None) -> Iterable[str]:
 
 
 def _width() -> int:
-    return shutil.get_terminal_size((_WIDTH, 24)).columns if sys.stdout.isatty() else _WIDTH
+    return shutil.get_terminal_size((_WIDTH, 24)).columns if is_terminal(sys.stdout) else _WIDTH
 
 
 def _print(lines: Iterable[str]) -> None:
     """Print lines; in colour on a terminal, by their first word."""
-    colours = sys.stdout.isatty() and "NO_COLOR" not in os.environ
+    colours = is_terminal(sys.stdout) and "NO_COLOR" not in os.environ
     for line in lines:
         word = line.partition(" ")[0]
         if colours and word in _COLOURS:

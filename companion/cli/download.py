@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, plain_errors
+from companion.cli.flags import EXIT_BAD_INPUT, is_terminal, plain_errors
 from companion.host.passing import EXIT_PASSING
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ class _DownloadBar:
         if self._first_line is not None:
             typer.echo(self._first_line, err=True)
             self._first_line = None
-        if not sys.stderr.isatty():
+        if not is_terminal(sys.stderr):
             return
         if self._bar is None:
             from rich.console import Console

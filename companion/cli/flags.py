@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO, get_type_hints
 
 import typer
 import typer.core
@@ -213,6 +213,11 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         for line in str(error).splitlines():
             typer.echo(with_load(redacted(f"companion: {line}")), err=True)
         raise typer.Exit(EXIT_PASSING if isinstance(error, PassingError) else code) from error
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a standard stream is a terminal. None: it is closed, as after `<&-` of a shell."""
+    return stream is not None and stream.isatty()
 
 
 def refuse(text: str) -> NoReturn:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_BAD_INPUT, EXIT_FAILED, plain_errors, refuse
+from companion.cli.flags import EXIT_BAD_INPUT, EXIT_FAILED, is_terminal, plain_errors, refuse
 from vision.redaction import redacted
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def init(
     another program has open is left alone. A file that is there is kept under a name with the time.
     Exit code 1: no autopilot was found.
     """
-    if not yes and not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not yes and not (is_terminal(sys.stdin) and is_terminal(sys.stdout)):
         refuse("init asks, and this is no terminal: add --yes, which takes the surest")
     from companion.doctor.facts import Facts, Machine
     from companion.doctor.service_query import find_service
@@ -111,7 +111,7 @@ def _asking(*, yes: bool) -> Asking:
     from companion.setup.init import Asking
     from companion.setup.tried import Tried
 
-    width = shutil.get_terminal_size((_WIDTH, 24)).columns if sys.stdout.isatty() else _WIDTH
+    width = shutil.get_terminal_size((_WIDTH, 24)).columns if is_terminal(sys.stdout) else _WIDTH
 
     def say(line: str) -> None:
         typer.echo(redacted(line))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from companion.cli.download import Pull, model_after_pull
-from companion.cli.flags import EXIT_FAILED, plain_errors, warn_rendered_only
+from companion.cli.flags import EXIT_FAILED, is_terminal, plain_errors, warn_rendered_only
 from companion.host.journal import log_to_standard_error
 from companion.host.tasks import spawn
 from vision.gc_pause import gc_paused
@@ -105,7 +105,7 @@ async def _run_until_signal(settings: Settings, service: Service, on_page: Calla
         spawn(_run_dashboard(settings, ready, on_page), "dashboard"),
         spawn(_warn_of_models(service), "warning of models"),
     ]
-    if sys.stderr.isatty():
+    if is_terminal(sys.stderr):
         beside.append(spawn(_remind(service), "reminder"))
     try:
         await running

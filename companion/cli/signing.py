@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from companion.cli.flags import EXIT_FAILED, Command, plain_errors, refuse, settings_command
+from companion.cli.flags import EXIT_FAILED, Command, is_terminal, plain_errors, refuse, settings_command
 
 if TYPE_CHECKING:
     from companion.settings import Settings
@@ -108,7 +108,7 @@ def send(
 
 
 def _confirm(question: str) -> None:
-    if not sys.stdin.isatty():
+    if not is_terminal(sys.stdin):
         refuse(f"{question} Then give --yes")
     if not typer.confirm(question, default=False):
         raise typer.Exit(EXIT_FAILED)

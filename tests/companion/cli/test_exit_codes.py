@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import socket
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import pytest
 
 from companion.host.passing import EXIT_PASSING
 from mavlink_sim.testing import free_port
-from tests.companion.command_line import COLUMNS, companion_here
+from tests.companion.command_line import COLUMNS, companion, companion_here
 
 pytestmark = pytest.mark.realtime
 
@@ -150,6 +151,18 @@ def test_passing_failure_and_wrong_settings_differ(
     assert [line for line in lines if line.startswith("companion: ")] == lines[-1:]
     assert named.format(**words) in lines[-1]
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("words", ["init", "signing send --key-file key"])
+def test_closed_stream_is_no_terminal(words: str, tmp_path: Path) -> None:
+    companion("signing", "new", "key", cwd=tmp_path)
+    program = f"exec {shlex.quote(sys.executable)} -m companion.cli {words} <&-"
+    done = subprocess.run(
+        ["sh", "-c", program], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode in (1, 2)
+    assert "Traceback" not in done.stderr
+    assert done.stderr.startswith("companion: ")
 
 
 def test_closed_standard_input_is_a_wrong_setting(tmp_path: Path) -> None:
