@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import sys
 import time
@@ -82,8 +83,12 @@ def init(
             "companion: no autopilot found: see above, mend it, and run companion init again", err=True
         )
         raise typer.Exit(EXIT_FAILED)
-    user = "" if os.geteuid() == 0 else " --user"
-    typer.echo(f"next: companion doctor; companion run, or companion install{user}")
+    if not text or path.resolve() == default_target().resolve():
+        user = "" if os.geteuid() == 0 else " --user"
+        typer.echo(f"next: companion doctor; companion run, or companion install{user}")
+    else:
+        given = f"--config {shlex.quote(str(path))}"
+        typer.echo(f"next: companion doctor {given}; companion run {given}")
 
 
 def _finish(target: Target, text: str, *, yes: bool, dry_run: bool) -> None:
@@ -93,7 +98,7 @@ def _finish(target: Target, text: str, *, yes: bool, dry_run: bool) -> None:
     from companion.setup.target import check_text
 
     path = target.path
-    with plain_errors(ConfigurationError):
+    with plain_errors(ConfigurationError, OSError):
         check_text(path, text)
     for line in difference(target.text, text, path):
         typer.echo(redacted(line))
@@ -135,8 +140,8 @@ def _asking(*, yes: bool) -> Asking:
 
 
 def _check_writable(path: Path) -> None:
-    path = path.absolute()
-    place = next(each for each in (path, *path.parents) if each.exists())
-    if not os.access(place, os.W_OK) or (place != path and not place.is_dir()):
+    """Refuse a file that could not be replaced: that needs its folder, or one above it."""
+    place = next(each for each in path.resolve().parents if each.exists())
+    if not os.access(place, os.W_OK | os.X_OK) or not place.is_dir():
         typer.echo(f"companion: {path}: this user may not write {place}; give another --output", err=True)
         raise typer.Exit(EXIT_BAD_INPUT)

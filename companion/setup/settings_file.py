@@ -7,6 +7,7 @@ import difflib
 import os
 import re
 import shutil
+import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -117,7 +118,7 @@ def difference(before: str, after: str, path: Path) -> Iterator[str]:
 def write(path: Path, text: str, now_s: float | None = None) -> Path | None:
     """Write a settings file at once, and keep the former one beside it under a name with the time.
 
-    Its owner and mode stay; a link is followed.
+    Both have its owner and mode; a link is followed. A new file of root can be read by the service's user.
 
     Returns:
         The copy of the former file; None: there was none.
@@ -128,27 +129,42 @@ def write(path: Path, text: str, now_s: float | None = None) -> Path | None:
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = None
-    if path.exists():
-        kept = _free_name(path, time.time() if now_s is None else now_s)
-        shutil.copy2(path, kept)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
-        with partial.open("x", encoding="utf-8") as opened:
-            opened.write(text)
-            opened.flush()
-            os.fsync(opened.fileno())
-        if kept is not None:
-            shutil.copymode(kept, partial)
-            status = path.stat()
-            with suppress(PermissionError):  # another user's file, in a folder of ours
-                os.chown(partial, status.st_uid, status.st_gid)
+        if path.exists():
+            kept = _free_name(path, time.time() if now_s is None else now_s)
+            _create(kept, path.read_bytes(), like=path)
+            shutil.copystat(path, kept)
+        _create(partial, text.encode(), like=path)
         os.replace(partial, path)
+    except BaseException:
+        if kept is not None:
+            kept.unlink(missing_ok=True)
+        raise
     finally:
         partial.unlink(missing_ok=True)
     return kept
 
 
+def _create(path: Path, data: bytes, *, like: Path) -> None:
+    """Write a new file with owner and mode of another, which may be missing. Never through a link."""
+    former = like.stat() if like.exists() else None
+    # The file may have an address with a password: nobody else reads it before it has its mode.
+    mode = 0o666 if former is None else 0o600
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    with open(descriptor, "wb") as opened:
+        opened.write(data)
+        if former is not None:
+            with suppress(PermissionError):  # another user's file, in a folder of ours
+                os.fchown(descriptor, former.st_uid, former.st_gid)
+            os.fchmod(descriptor, stat.S_IMODE(former.st_mode))
+        elif os.geteuid() == 0:
+            os.fchmod(descriptor, 0o644)  # whatever root's umask is
+        opened.flush()
+        os.fsync(descriptor)
+
+
 def _free_name(path: Path, now_s: float) -> Path:
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now_s))
     names = (f"{path.name}.{stamp}{suffix}" for suffix in ("", *(f"-{number}" for number in range(2, 100))))
-    return next(each for each in map(path.with_name, names) if not each.exists())
+    return next(each for each in map(path.with_name, names) if not os.path.lexists(each))

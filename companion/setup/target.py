@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from companion.settings import Settings
-from companion.settings.layers import SettingsFiles, system_file, user_file
+from companion.settings.layers import SettingsFiles, settings_files, system_file, user_file
 from companion.settings.reading import ConfigurationError, load_layers, load_settings
 from companion.settings.toml_text import parse_toml
 from companion.setup.settings_file import Change, value_in
@@ -63,9 +63,8 @@ def read_target(path: Path) -> Target:
     """
     is_there = _is_file(path)
     files: tuple[Path, ...] = ()
-    system = system_file()
-    if path.resolve() == user_file().resolve() and system.exists():
-        files = (system,)
+    if path.resolve() == user_file().resolve():
+        files = tuple(each for each in settings_files().files if each.resolve() != path.resolve())
     below = load_layers(SettingsFiles(files), environment={}).settings
     if not is_there:
         return Target(path, "", {}, below, below)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import pty
@@ -22,7 +23,9 @@ import pytest
 from companion.doctor import facts as doctor_facts
 from companion.doctor.facts import CameraTrial, Facts, Machine
 from companion.doctor.listening import Sender
-from companion.settings import Settings
+from companion.settings import Settings, reading
+from companion.settings.layers import SYSTEM_VARIABLE, user_file
+from companion.settings.reading import ConfigurationError
 from companion.setup import autopilots
 from companion.setup import init as setup
 from companion.setup.autopilots import Autopilot
@@ -220,6 +223,48 @@ def test_file_that_cannot_be_written_is_refused_first(dev: Path, tmp_path: Path)
     (tmp_path / "file").touch()
     done = companion_here("init", "--yes", "--output", tmp_path / "file" / "a.toml", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
+
+
+@pytest.mark.parametrize("name", ["locked/a.toml", "link.toml"])
+def test_folder_in_which_nothing_may_be_replaced_is_refused_first(
+    dev: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    (folder := tmp_path / "locked").mkdir()
+    (folder / "a.toml").touch()
+    (tmp_path / "link.toml").symlink_to(folder / "a.toml")
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda path, mode: path != folder.resolve() and access(path, mode))
+    done = companion_here("init", "--yes", "--output", tmp_path / name, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+
+
+@pytest.mark.realtime
+def test_next_line_is_for_the_file_that_was_written(
+    dev: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = file.rename(file.with_name("my board.toml"))
+    with heartbeats() as port:
+        monkeypatch.setattr(autopilots, "UDP_PORTS", (port,))
+        done = companion_here("init", "--yes", "--output", own, cwd=own.parent)
+    assert f"companion run --config '{own}'" in done.stdout.splitlines()[-1]
+
+
+def test_system_file_that_is_not_readable_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = tmp_path / "companion.toml"
+    system.touch()
+    monkeypatch.setenv(SYSTEM_VARIABLE, str(system))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    stat = os.stat
+
+    def refused(path: str | Path, **options: Any) -> os.stat_result:
+        if str(path) == str(system):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return stat(path, **options)
+
+    monkeypatch.setattr(os, "stat", refused)
+    monkeypatch.setattr(reading, "read_text", refused)
+    with pytest.raises(ConfigurationError, match="Permission denied"):
+        read_target(user_file())
 
 
 def proposed(

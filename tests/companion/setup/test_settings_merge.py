@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -75,6 +78,61 @@ def test_multi_line_value_is_changed_only_if_the_rest_stays() -> None:
         "image_size": 320,
         "runtime": "openvino",
     }
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_no_one_else_reads_a_private_file_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, umask: int
+) -> None:
+    modes: list[int] = []
+    create = os.open
+
+    def opened(path: str | Path, flags: int, mode: int = 0o777) -> int:
+        modes.append(mode)
+        return create(path, flags, mode)
+
+    path = tmp_path / "companion.toml"
+    path.write_text('[source]\nuri = "rtsp://anna:geheim@camera/1"\n')
+    path.chmod(0o640)
+    monkeypatch.setattr(os, "open", opened)
+    before = os.umask(umask)
+    try:
+        kept = write(path, "second\n", now_s=1e9)
+    finally:
+        os.umask(before)
+    assert modes == [0o600, 0o600]
+    assert kept is not None
+    assert [each.stat().st_mode & 0o777 for each in (path, kept)] == [0o640, 0o640]
+
+
+def test_new_file_of_root_is_read_by_the_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    before = os.umask(0o077)
+    try:
+        write(tmp_path / "companion.toml", "new\n")
+    finally:
+        os.umask(before)
+    assert (tmp_path / "companion.toml").stat().st_mode & 0o777 == 0o644
+
+
+def test_copy_is_not_written_through_a_link(tmp_path: Path) -> None:
+    (path := tmp_path / "companion.toml").write_text("first\n")
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(1e9))
+    (tmp_path / f"companion.toml.{stamp}").symlink_to(tmp_path / "elsewhere")
+    write(path, "second\n", now_s=1e9)
+    assert not (tmp_path / "elsewhere").exists()
+
+
+def test_full_disk_leaves_the_former_file_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path := tmp_path / "companion.toml").write_text("first\n")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        write(path, "second\n")
+    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("companion.toml", "first\n")]
 
 
 def test_former_file_is_kept_with_its_mode(tmp_path: Path) -> None:
