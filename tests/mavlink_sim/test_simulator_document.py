@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+import yaml
 
 from mavlink_sim.cli.main import main
 from mavlink_sim.realtime.fleet import Fleet
@@ -96,6 +97,13 @@ def test_the_example_for_pytest_passes(pytester: pytest.Pytester, monkeypatch: p
         "-p", "mavlink_sim.pytest_plugin", "-p", "no:cacheprovider", timeout=100
     )
     result.assert_outcomes(passed=1)
+
+
+def test_example_for_continuous_integration_is_list_of_steps() -> None:
+    (block,) = blocks("yaml")
+    steps = yaml.safe_load(block)
+    assert all("run" in step or "uses" in step for step in steps)
+    assert "--vehicle-logs=" in steps[1]["run"]
 
 
 def test_vehicle_needs_only_documented_packages() -> None:
