@@ -5,6 +5,8 @@ All consoles of a user share the file. Each line is appended by one write, so no
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import stat
 from collections.abc import Sequence
@@ -36,9 +38,13 @@ class CommandHistory:
     def lines(self) -> Sequence[str]:
         """Return the lines, the oldest first, of other consoles too; one that was repeated only once."""
         try:
-            with open(self._path, errors="replace") as file:
-                file.seek(max(os.fstat(file.fileno()).st_size - _LONGEST_FILE, 0))
-                lines = [line for line in file.read().split("\n")[:-1] if line.isprintable()]
+            with open(self._path, "rb") as file:
+                # A first line that is cut would be another command.
+                if (begin := os.fstat(file.fileno()).st_size - _LONGEST_FILE) > 0:
+                    file.seek(begin)
+                    file.readline()
+                text = file.read().decode(errors="replace")
+            lines = [line for line in text.split("\n")[:-1] if line.isprintable()]
         except OSError:
             lines = self._own
         newest = [line for line, after in zip(lines, [*lines[1:], ""], strict=False) if line != after]
@@ -48,6 +54,7 @@ class CommandHistory:
         """Append a line, without secrets. Raises OSError: it is kept by this console alone."""
         line = redacted(line)
         self._own = [*self._own, line][-KEPT_LINES:]
+        self._check_owner()
         self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
         descriptor = os.open(self._path, flags, 0o600)
@@ -55,16 +62,26 @@ class CommandHistory:
             about = os.fstat(descriptor)
             if stat.S_ISREG(about.st_mode) and stat.S_IMODE(about.st_mode) != 0o600:
                 os.fchmod(descriptor, 0o600)
-            os.write(descriptor, f"{line}\n".encode("utf-8", "replace"))
+            os.write(descriptor, f"{line}\n".encode(errors="replace"))
         finally:
             os.close(descriptor)
         if about.st_size > _LONGEST_FILE:
             self._shorten()
 
+    def _check_owner(self) -> None:
+        """Raise PermissionError for a place of another user, who could lead root elsewhere by a link.
+
+        So `sudo -E` leaves no file of root there either, which the user's own console could not write.
+        """
+        for each in (self._path, *self._path.parents):
+            with contextlib.suppress(FileNotFoundError):
+                if each.lstat().st_uid not in (0, os.geteuid()):
+                    raise PermissionError(errno.EPERM, "belongs to another user", str(each))
+
     def _shorten(self) -> None:
         """Keep the newest lines. One that another console adds at this moment may be lost."""
         lines = self.lines()[-KEPT_LINES // 2 :]
         shorter = self._path.with_name(f"{self._path.name}.{os.getpid()}")
-        with open(os.open(shorter, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
-            file.writelines(f"{line}\n" for line in lines)
+        with open(os.open(shorter, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write("".join(f"{line}\n" for line in lines).encode(errors="replace"))
         shorter.replace(self._path)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -55,6 +57,48 @@ def test_without_a_file_the_lines_are_those_of_this_console(tmp_path: Path) -> N
     assert history.lines() == ["hold"]
     CommandHistory(Path("/dev/null")).add("hold")  # its mode is left alone
     assert stat.S_IMODE(os.stat("/dev/null").st_mode) == 0o666
+
+
+@pytest.mark.parametrize("foreign", ["home", "home/console_history"])
+def test_nothing_is_written_in_the_place_of_another_user(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, foreign: str
+) -> None:
+    (tmp_path / "home").mkdir()
+    (tmp_path / "elsewhere").touch(0o644)
+    path = tmp_path / "home/console_history"
+    path.symlink_to(tmp_path / "elsewhere")
+    lstat = Path.lstat
+
+    def other(each: Path) -> os.stat_result:
+        found = list(lstat(each))
+        return os.stat_result([*found[:4], 65534, *found[5:]]) if each == tmp_path / foreign else lstat(each)
+
+    monkeypatch.setattr(Path, "lstat", other)
+    history = CommandHistory(path)
+    with pytest.raises(PermissionError, match="another user"):
+        history.add("hold")
+    about = (tmp_path / "elsewhere").stat()
+    assert (about.st_size, stat.S_IMODE(about.st_mode)) == (0, 0o644)
+
+
+def test_cut_line_is_no_command(tmp_path: Path) -> None:
+    path = tmp_path / "history"
+    path.write_text("".join(f"goto {number} {'ä' * 4000}\n" for number in range(60)))
+    assert all(line.startswith("goto ") for line in CommandHistory(path).lines())
+
+
+def test_file_is_utf_8_whatever_the_locale_is(tmp_path: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path; from companion.operator import command_history as h; "
+        "h._LONGEST_FILE = 60; c = h.CommandHistory(Path(sys.argv[1])); "
+        "[c.add(f'ask \\u8eca {n:03}') for n in range(20)]"
+    )
+    environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    path = tmp_path / "history"
+    subprocess.run([sys.executable, "-c", program, path], env=environment, check=True, timeout=60)
+    lines = path.read_bytes().decode().splitlines()
+    assert lines == [f"ask 車 {number:03}" for number in range(20)][-len(lines) :]
+    assert 1 < len(lines) < 10
 
 
 def test_place_is_that_of_xdg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
