@@ -27,6 +27,7 @@ from companion.bus.client import (
 from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 from companion.host.tasks import spawn
 from companion.operator.console import Target
+from companion.operator.reply_text import printable
 
 T = TypeVar("T")
 
@@ -187,6 +188,4 @@ async def watched(session: zenoh.Session, vehicle: str, say: Callable[[str], Non
 
 
 def _event_line(event: EventBody) -> str:
-    """Without control characters, which a text of the autopilot could send to the terminal."""
-    text = "".join(each if each.isprintable() else "?" for each in event["text"])
-    return f"{event['level']}: {text}"
+    return printable(f"{event['level']}: {event['text']}")

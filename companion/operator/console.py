@@ -28,7 +28,7 @@ from companion.operator.command_history import CommandHistory, history_file
 from companion.operator.completion import completions, help_lines
 from companion.operator.line_editor import Key, LineEditor, common_beginning
 from companion.operator.line_output import LineOutput
-from companion.operator.reply_text import reply_text
+from companion.operator.reply_text import printable, reply_text
 from companion.operator.status_text import status_text
 from companion.settings.fields import toml_value
 from companion.settings.live import NARROWER, live_value_of_text
@@ -116,6 +116,10 @@ class Console:
 
     async def answer(self, line: str) -> Answer:
         """Execute a line: `help`, `status`, `set`, or a command. Never raises but for a cancellation."""
+        answer = await self._answer(line)
+        return Answer(printable(answer.text, "\n"), answer.code)
+
+    async def _answer(self, line: str) -> Answer:
         name, text = self._addressed(line.strip())
         target = self._targets[name]
         word, _, rest = text.partition(" ")

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import termios
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, redirect_stderr, suppress
 from pathlib import Path
 from typing import Any
@@ -180,6 +180,17 @@ async def test_sentence_that_fails_leaves_the_console(
 async def test_answers_have_the_codes_of_the_command_line(line: str, code: int, words: str) -> None:
     answer = await Console({"": Service().target}).answer(line)
     assert (answer.code, words in answer.text) == (code, True), answer
+
+
+async def test_control_characters_of_an_answer_do_not_reach_the_terminal() -> None:
+    async def command(text: str) -> Mapping[str, Any]:
+        return {"success": False, "reason": "PX4: \x1b]0;title\x07\x9b2J no"}
+
+    service = Service().target
+    target = Target(command, service.settings, service.status, service.commands)
+    answer = await Console({"": target}).answer("takeoff")
+    assert answer.text == "takeoff: failed: PX4: ?]0;title??2J no"
+    assert "\n" in (await Console({"": target}).answer("help")).text
 
 
 async def test_values_are_set_together_and_may_be_quoted() -> None:
