@@ -43,7 +43,7 @@ class KeptTimestamp:
 
     Attributes:
         start: read from the file, in units of 10 us since 2015; 0: there is none that can be used.
-        problem: why the file could not be read or written; empty: it could.
+        problem: why the file could not be read or written the last time; empty: it could.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -112,6 +112,7 @@ class KeptTimestamp:
                         return
                 self._replace(timestamp)
                 os.fsync(folder)
+                self.problem = ""
             finally:
                 os.close(folder)
         except OSError as error:
@@ -132,11 +133,11 @@ class KeptTimestamp:
 
     def _fail(self, what: str, error: Exception) -> None:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
-        if not self.problem:
+        said, self.problem = self.problem, f"{what}: {reason}"
+        if not said.endswith(f": {reason}"):
             logger.warning(
                 "signing timestamp %s: %s: %s; a start with a late clock will accept old messages",
                 self.path,
                 what,
                 reason,
             )
-        self.problem = f"{what}: {reason}"

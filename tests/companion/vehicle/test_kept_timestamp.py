@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import logging
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -122,6 +124,27 @@ def test_a_damaged_state_is_said_once_and_replaced(
     kept.flush()
     assert kept_in(tmp_path) > used
     assert len(caplog.records) == 1
+
+
+def test_a_problem_ends_and_another_one_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / FILE_NAME).touch()
+    kept = KeptTimestamp(tmp_path)
+    damaged = kept.problem
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", full)
+        kept.passed(timestamp_now())
+        kept.flush()
+        assert kept.problem not in ("", damaged)
+        assert len(caplog.records) == 2
+    kept.passed(timestamp_now() + 2 * ONE_MINUTE)
+    kept.flush()
+    assert kept.problem == ""
 
 
 def test_a_folder_that_cannot_be_written_is_said_once(
