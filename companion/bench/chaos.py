@@ -31,6 +31,7 @@ from typing import Any, Literal
 import zenoh
 
 from companion.bench.process_figures import Figures, settled_figures, total
+from companion.bench.stepped_clock import set_step
 from companion.bus.client import client_settings, listen, open_client
 from companion.bus.topics import command_key
 from companion.host.peer_data import copy_payload
@@ -214,7 +215,7 @@ async def _run(minutes: float, seed: int, period_s: float, say: Say, log_path: P
         key, clock, truth = folder / "signing.key", folder / "clock", folder / "truth.jsonl"
         key.touch(0o600)
         key.write_bytes(secrets.token_bytes(32))
-        clock.write_text("0")
+        set_step(clock, 0.0)
         options = SimOptions(
             camera,
             seed,
@@ -420,8 +421,8 @@ class _Soak:
             elif number is signal.SIGSTOP:
                 self._undo.append((now_s + fault.lasts_s, partial(_kill, pid, signal.SIGCONT)))
         elif fault.target == "clock":
-            self._clock.write_text(str(_HOUR_S if fault.what.startswith("+") else -_HOUR_S))
-            self._undo.append((now_s + fault.lasts_s, partial(self._clock.write_text, "0")))
+            set_step(self._clock, _HOUR_S if fault.what.startswith("+") else -_HOUR_S)
+            self._undo.append((now_s + fault.lasts_s, partial(set_step, self._clock, 0.0)))
         else:
             size = min(round(_free_memory() * _MEMORY_SHARE), _MEMORY_MOST_MB * 1_000_000)
             child = subprocess.Popen([sys.executable, "-c", _ALLOCATES, str(size), str(fault.lasts_s)])

@@ -13,16 +13,24 @@ from collections.abc import Callable
 from pathlib import Path
 
 
+def set_step(offset_file: Path, seconds: float) -> None:
+    """Write the file at once: a process that reads the time meanwhile has the one or the other."""
+    new = offset_file.with_name(f"{offset_file.name}.new")
+    new.write_text(str(seconds))
+    new.replace(offset_file)
+
+
 def step_clock(offset_file: Path) -> None:
     """Let `time.time` and `time.time_ns` of this process follow the file, from now on."""
     time_s, time_ns, stat = time.time, time.time_ns, offset_file.stat
-    read: tuple[int, float] = (-1, 0.0)
+    read: tuple[tuple[int, int], float] = ((-1, -1), 0.0)
 
     def offset_s() -> float:
         nonlocal read
-        changed_ns = stat().st_mtime_ns
-        if read[0] != changed_ns:
-            read = (changed_ns, float(offset_file.read_text()))
+        about = stat()
+        version = (about.st_ino, about.st_mtime_ns)
+        if read[0] != version:
+            read = (version, float(offset_file.read_text()))
         return read[1]
 
     def stepped_s() -> float:

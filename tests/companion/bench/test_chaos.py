@@ -13,6 +13,7 @@ import pytest
 
 from companion.bench.chaos import FAULTS, ChaosResult, differences, faults_in_order, run_chaos
 from companion.bench.process_figures import Figures, figures_of, total
+from companion.bench.stepped_clock import set_step
 from mavlink_sim.faults.grammar import parse_fault
 from mavlink_sim.faults.kinds import KINDS
 
@@ -88,6 +89,15 @@ def test_the_clock_of_a_process_follows_the_file(tmp_path: Path) -> None:
     assert words[1] / 1e9 == pytest.approx(now_s + 3600.0, abs=60.0)
     assert words[2] == pytest.approx(now_s - 3600.0, abs=60.0)
     assert words[3] / 1e9 == pytest.approx(now_s - 3600.0, abs=60.0)
+
+
+def test_a_process_never_reads_half_a_step(tmp_path: Path) -> None:
+    set_step(path := tmp_path / "clock", 0.0)
+    with path.open() as read_meanwhile:
+        set_step(path, 3600.0)
+        assert float(read_meanwhile.read()) == 0.0
+    assert float(path.read_text()) == 3600.0
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.slow
