@@ -232,7 +232,7 @@ class Terminal:
 
         def read() -> None:
             try:
-                for line in sys.stdin:
+                for line in sys.stdin or ():
                     loop.call_soon_threadsafe(self._lines.put_nowait, line.rstrip("\n"))
                 loop.call_soon_threadsafe(self._lines.put_nowait, None)
             except (RuntimeError, ValueError):  # the loop or the file is closed
