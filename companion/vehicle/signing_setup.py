@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 from companion.vehicle.byte_link import ByteLink, Source, open_link
 from companion.vehicle.driver import LinkError
-from companion.vehicle.framing import Frame, Framer, pack_frame
+from companion.vehicle.framing import MAGIC_V1, Frame, Framer, pack_frame
 from companion.vehicle.kept_timestamp import KeptTimestamp
 from companion.vehicle.link_url import LinkScheme, LinkUrl
 from companion.vehicle.signing import (
@@ -232,13 +232,21 @@ class _Exchange:
         if key is not None and is_signed_with(raw, key):
             what = "signs with this key and answers nothing that is signed with it"
             advice = "restart it, then send again: it may have seen later timestamps"
+        elif raw[0] == MAGIC_V1:
+            what = "sends MAVLink 1, which has no signatures"
+            advice = (
+                "PX4: MAV_PROTO_VER 2"
+                if self.autopilot == PX4
+                else "ArduPilot: 2 as SERIALx_PROTOCOL of this port"
+            )
+            advice += ", and restart it"
         elif self.autopilot == PX4:
             what = "goes on as before"
             advice = (
                 "PX4 takes a key by its USB port alone, from 1.17 on (serial:///dev/ttyACM0:57600); with "
                 "MAV_SIGN_CFG 2 it needs --present-key-file"
             )
-        elif is_signed_with_a_key(self._heartbeat.raw):
+        elif is_signed_with_a_key(raw):
             what = "signs with another key"
             advice = "give the file of that one as --present-key-file, or use its USB port"
         else:

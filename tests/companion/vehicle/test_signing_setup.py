@@ -11,6 +11,7 @@ from contextlib import contextmanager
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
+from companion.vehicle import signing_setup
 from companion.vehicle.connection_advice import no_answer_advice
 from companion.vehicle.driver import LinkError
 from companion.vehicle.framing import Framer
@@ -112,6 +113,18 @@ def test_key_is_sent_to_the_autopilot_alone() -> None:
     keys = [frame.padded(42) for frame in frames if frame.message_id == mavlink.MAVLINK_MSG_ID_SETUP_SIGNING]
     assert keys
     assert {(key[8], key[9], key[10:]) for key in keys} == {(1, 1, KEY)}
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "parameter"), [(PX4, "MAV_PROTO_VER"), (ARDUPILOT, "SERIALx_PROTOCOL")]
+)
+def test_mavlink_1_is_named(monkeypatch: pytest.MonkeyPatch, autopilot: int, parameter: str) -> None:
+    for name in ("_RADIO_S", "_ATTEMPT_S", "_ASK_S"):
+        monkeypatch.setattr(signing_setup, name, 0.2)
+    message = mavlink.MAVLink_heartbeat_message(2, autopilot, 0, 0, 3, 3)
+    old = bytes(message.pack(mavlink.MAVLink(None, 1, 1), force_mavlink1=True))
+    with talking(old) as (port, _), pytest.raises(SigningSetupError, match=f"MAVLink 1.*{parameter}"):
+        send(port, KEY)
 
 
 def test_px4s_key_of_zeros_is_no_key() -> None:
