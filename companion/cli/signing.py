@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +32,7 @@ def new_key(
 
     with plain_errors(SigningKeyError):
         write_new_key(file)
-    typer.echo(f"{file}: a new key. Next: companion signing send --key-file {file}")
+    typer.echo(f"{file}: a new key. Next: companion signing send --key-file {shlex.quote(str(file))}")
 
 
 @settings_command(signing, "vehicle.url", "vehicle.system_id")
@@ -56,6 +57,7 @@ def send(
     from companion.doctor.facts import Facts, Machine
     from companion.doctor.processes import listed
     from companion.host.state_folder import state_folder
+    from companion.settings.fields import toml_value
     from companion.vehicle.driver import LinkError
     from companion.vehicle.kept_timestamp import KeptTimestamp
     from companion.vehicle.link_url import parse_link_url
@@ -104,7 +106,7 @@ def send(
         )
         typer.echo(f"it takes what is unsigned on this link too: {advice}")
     if settings.vehicle.signing_key_file is None:
-        typer.echo(f'next: set vehicle.signing_key_file = "{Path(path or "").absolute()}"')
+        typer.echo(f"next: set vehicle.signing_key_file = {toml_value(str(Path(path or '').absolute()))}")
 
 
 def _confirm(question: str) -> None:

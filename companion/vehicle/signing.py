@@ -94,11 +94,15 @@ def write_new_key(path: Path) -> None:
     """
     try:
         descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-        with open(descriptor, "w", encoding="ascii") as file:
-            os.fchmod(descriptor, 0o600)
-            file.write(f"{secrets.token_urlsafe(KEY_LENGTH)}\n")
-            file.flush()
-            os.fsync(descriptor)
+        try:
+            with open(descriptor, "w", encoding="ascii") as file:
+                os.fchmod(descriptor, 0o600)
+                file.write(f"{secrets.token_urlsafe(KEY_LENGTH)}\n")
+                file.flush()
+                os.fsync(descriptor)
+        except OSError:  # the disk is full: no part of a key stays
+            path.unlink(missing_ok=True)
+            raise
     except FileExistsError:
         raise SigningKeyError(f"{path}: exists already, and may be in use; give another name") from None
     except OSError as error:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import shlex
 import stat
 import subprocess
 import sys
@@ -11,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 from companion.cli.commands import app
-from companion.vehicle.signing import read_key
+from companion.vehicle.signing import SigningKeyError, read_key, write_new_key
 from mavlink_sim.testing import free_port
 
 pytestmark = pytest.mark.realtime
@@ -29,6 +32,21 @@ def test_new_key_is_private_random_and_never_replaced(tmp_path: Path) -> None:
     assert runner.invoke(app, ["signing", "new", str(files[0])]).exit_code == 2
     assert files[0].read_bytes() == before
     assert runner.invoke(app, ["signing", "new", str(tmp_path / "no" / "key")]).exit_code == 2
+
+
+def test_name_of_a_key_with_a_space_can_be_copied(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["signing", "new", str(tmp_path / "mein schlüssel")])
+    assert shlex.split(done.output)[-1] == str(tmp_path / "mein schlüssel")
+
+
+def test_full_disk_leaves_no_part_of_a_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(SigningKeyError, match="No space"):
+        write_new_key(tmp_path / "key")
+    assert list(tmp_path.iterdir()) == []
 
 
 LISTENS = "import socket, sys; s = socket.socket(type=socket.SOCK_DGRAM); s.bind(('127.0.0.1', 0)); \
