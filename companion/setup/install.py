@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -21,6 +21,7 @@ from companion.setup.files import (
     TMPFILES,
     UNIT,
     Entry,
+    Link,
     below,
     system_entries,
     user_entries,
@@ -65,21 +66,28 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
     changed = [entry for entry in entries if not entry.is_there()]
     for entry in entries:
         _say_entry(entry, say, whole=dry_run)
-        if not dry_run and entry in changed:
+        if not dry_run and entry in changed and not isinstance(entry, Link):
             entry.write()
     instances = [] if host.user else host.instances()
     # Who runs instances alone has disabled the first one.
     starts = not instances or host.show(UNIT).get("UnitFileState") == "enabled"
     watched = [UNIT] if starts else []
     watched += [unit for unit in instances if changed and host.is_active(unit)]
-    commands = [*_preparing(host), *_freeing(host, settings, say)]
-    commands += _starting(host, instances, starts=starts, changed=bool(changed))
     before = {} if dry_run else {unit: host.show(unit).get("InvocationID") for unit in watched}
     began_s = time.time()
-    for command in commands:
-        say(f"run        {shlex.join(command)}")
-        if not dry_run:
-            host.run(command)
+
+    def do(commands: Iterable[tuple[str, ...]]) -> None:
+        for command in commands:
+            say(f"run        {shlex.join(command)}")
+            if not dry_run:
+                host.run(command)
+
+    do([*_preparing(host), *_freeing(host, settings, say)])
+    # Last: after an installation that was interrupted, the next one sees the other version, and restarts.
+    for entry in changed:
+        if not dry_run and isinstance(entry, Link):
+            entry.write()
+    do(_starting(host, instances, starts=starts, changed=bool(changed)))
     if host.user:
         for line in _advice_of_user(host):
             say(line)

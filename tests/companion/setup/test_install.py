@@ -44,6 +44,7 @@ class Computer:
         self.commands: list[tuple[str, ...]] = []
         self.said: list[str] = []
         self.states: dict[str, str] = {}
+        self.failing = ""
         self.host = Host(root=root, run=self._run)
         for folder in ("run/systemd/system", "run/udev", "opt/companion", "dev", "etc/companion"):
             (root / folder).mkdir(parents=True)
@@ -65,6 +66,8 @@ class Computer:
 
     def _run(self, command: Sequence[str]) -> str:
         words = tuple(command)
+        if words[0] == self.failing:
+            raise SetupError(words[0])
         if words[1] == "show":
             return self.states.get(words[2], "ActiveState=inactive")
         if words[1] != "list-units":
@@ -116,6 +119,19 @@ def test_second_install_writes_and_restarts_nothing(computer: Computer) -> None:
     assert computer.files() == before
     assert computer.ran("systemctl", "--no-block", "start", UNIT)
     assert not any("restart" in words for words in computer.commands)
+
+
+def test_update_after_an_interrupted_one_restarts(computer: Computer) -> None:
+    computer.install()
+    computer.version(NEW)
+    computer.failing = "systemd-tmpfiles"
+    with pytest.raises(SetupError):
+        computer.install()
+    computer.failing = ""
+    computer.commands.clear()
+    computer.install()
+    assert (computer.root / CURRENT.relative_to("/")).readlink() == NEW
+    assert computer.ran("systemctl", "--no-block", "restart", UNIT)
 
 
 def test_dry_run_prints_and_changes_nothing(computer: Computer) -> None:
