@@ -146,9 +146,11 @@ class Console:
         """Return where the word before the cursor begins, and the words that it can become."""
         name, _ = self._addressed(before.lstrip())
         vehicles = tuple(self._targets) if len(self._targets) > 1 else ()
-        return completions(
-            before, await self._schema(name), keys=tuple(NARROWER), recent=await recent(), vehicles=vehicles
-        )
+        schema, lines = await self._schema(name), await recent()
+        try:
+            return completions(before, schema, keys=tuple(NARROWER), recent=lines, vehicles=vehicles)
+        except (KeyError, TypeError, AttributeError):  # the schema of another version
+            return len(before), []
 
     def _addressed(self, line: str) -> tuple[str, str]:
         """Return the vehicle that a line is for, and the line without its name."""

@@ -294,6 +294,19 @@ async def test_tab_completes_and_lists(edited: Edited) -> None:
         await console.type("\t\tx", "> set guidance.max_altitude_m=x")
 
 
+@pytest.mark.parametrize("schema", [{"$defs": {"goto": {}}}, {"$defs": ["goto"]}, {"$defs": {"goto": 5}}])
+async def test_schema_of_another_version_completes_nothing(schema: dict[str, Any]) -> None:
+    async def commands() -> Mapping[str, Any]:
+        return schema
+
+    async def recent() -> list[str]:
+        return []
+
+    service = Service().target
+    console = Console({"": Target(service.command, service.settings, service.status, commands)})
+    assert await console.completions("goto n", recent) == (6, [])
+
+
 async def test_history_is_that_of_the_console_before(edited: Edited, terminal: int) -> None:
     async with edited as console:
         await console.type("hold\n", "hold: done: reason 1", ">")
