@@ -156,7 +156,7 @@ def _on_serial(path: Path, first: int | None, facts: Facts, listen: Listen) -> t
     bauds = [each for each in (first, *((_USB_BAUD,) if is_usb else BAUDS)) if each is not None]
     if (refused := _not_opened(where, LinkUrl(LinkScheme.SERIAL, (str(name), bauds[0])), facts)) is not None:
         return [], refused
-    noisy: list[int] = []
+    noisy: list[int] = []  # the others were silent
     for baud in dict.fromkeys(bauds):
         url = LinkUrl(LinkScheme.SERIAL, (str(path), baud))
         received = listen(url, _PORT_S if is_usb else _BAUD_S, _is_noise)
@@ -170,7 +170,7 @@ def _on_serial(path: Path, first: int | None, facts: Facts, listen: Listen) -> t
     if noisy:
         return [], Tried(
             where,
-            f"bytes that are not MAVLink at {', '.join(map(str, bauds))} baud",
+            f"bytes that are not MAVLink at {', '.join(map(str, noisy))} baud",
             "PX4: MAV_1_CONFIG and SER_TEL2_BAUD, ArduPilot: SERIAL2_PROTOCOL 2 and SERIAL2_BAUD; or another "
             "device is connected here",
         )

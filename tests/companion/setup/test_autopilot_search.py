@@ -75,6 +75,17 @@ def test_line_of_another_device_is_named_as_noise(computer: Computer) -> None:
     assert tried[str(line)].advice
 
 
+def test_only_rates_with_bytes_are_named_as_noise(computer: Computer) -> None:
+    line = computer.root / "dev" / "ttyAMA0"
+    facts, tried = Facts(Settings(), computer.machine()), dict[str, Tried]()
+
+    def listen(url: LinkUrl, *_: object) -> Received:
+        return Received(1.0, skipped_bytes=9 if url.address[1] == 57600 else 0)
+
+    find_autopilots(facts, lambda each: tried.update({each.where: each}), listen=listen)
+    assert [str(baud) for baud in BAUDS if str(baud) in tried[str(line)].found] == ["57600"]
+
+
 def test_silent_line_names_the_rates_that_were_tried(computer: Computer) -> None:
     _, tried = found(computer, Wires())
     text = tried[str(computer.root / "dev" / "ttyAMA0")].found
