@@ -142,6 +142,14 @@ def _modem_manager(facts: Facts) -> Iterator[Check]:
             yield warning("ModemManager", found, "sudo systemctl disable --now ModemManager")
 
 
+def console_advice(name: str) -> str:
+    """Return what ends the kernel's console on a serial device, and with it the login terminal there."""
+    return (
+        f"remove console={name} (serial0) from the kernel's command line; on a Raspberry Pi: sudo "
+        "raspi-config nonint do_serial_cons 1"
+    )
+
+
 def _kernel_console(facts: Facts) -> Iterator[Check]:
     path = serial_device(facts)
     if path is None:
@@ -151,8 +159,7 @@ def _kernel_console(facts: Facts) -> Iterator[Check]:
         yield fault(
             "kernel console",
             f"the kernel prints its messages on {path}",
-            f"remove console={name} (serial0) from the kernel's command line; on a Raspberry Pi: sudo "
-            "raspi-config nonint do_serial_cons 1",
+            console_advice(name),
         )
 
 

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from companion.doctor.facts import group_name, user_of_service
+from companion.doctor.serial_line import console_advice
 from companion.settings import Settings
 from companion.settings.layers import SYSTEM_FILE, user_file
 from companion.settings.reading import ConfigurationError
@@ -192,7 +193,7 @@ def _console_line(host: Host, settings: Settings) -> str | None:
         return None
     return (
         f"warning    the kernel has a console on {device.name}, and with it comes the login terminal at "
-        f"every boot: remove console={device.name} from its command line"
+        f"every boot: {console_advice(device.name)}"
     )
 
 

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from companion.doctor.serial_line import console_advice
 from companion.doctor.service_query import Found
 from companion.setup import flight, install, uninstall
 from companion.setup.files import (
@@ -325,6 +326,14 @@ def test_login_terminals_of_the_serial_line_are_disabled(computer: Computer) -> 
     computer.install()
     disabled = [words[-1] for words in computer.commands if words[1] == "disable"]
     assert disabled == ["serial-getty@ttyTHS1.service", "nvgetty.service"]
+
+
+def test_console_of_the_kernel_is_named_as_doctor_names_it(computer: Computer) -> None:
+    (active := computer.root / "sys/class/tty/console/active").parent.mkdir(parents=True)
+    active.write_text("tty0 ttyTHS1\n")
+    computer.install()
+    (line,) = [line for line in computer.said if line.startswith("warning")]
+    assert console_advice("ttyTHS1") in line
 
 
 def test_no_login_terminal_is_disabled_for_a_network_link(computer: Computer) -> None:
