@@ -7,6 +7,7 @@ one of that name. A file that stands twice, by two names too, is one layer.
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -81,7 +82,7 @@ def settings_files(config: Path | None = None, *, only_config: bool = False) -> 
                 files.append(user)
             elif config is None or os.path.realpath(config) != os.path.realpath(user):
                 found = f"{user} is not read: it belongs to {owner}"
-                not_read.append(NotRead(found, f"--config {user} reads it"))
+                not_read.append(NotRead(found, f"--config {shlex.quote(str(user))} reads it"))
     if config is not None:
         files.append(config)
     # At its last place: there it decides.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ VALUES: dict[str, list[Any]] = {
 def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Path]:
     """The paths of the files of system, user and `--config`; the last one and the folders are there."""
     monkeypatch.setenv(SYSTEM_VARIABLE, str(tmp_path / "etc" / "companion.toml"))
-    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "home of anna"))
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
     found = {"system": system_file(), "user": user_file(), "config": tmp_path / "config.toml"}
@@ -172,6 +173,7 @@ def test_file_of_another_user_is_not_read(
         (not_read,) = files.not_read
         assert str(places["user"]) in not_read.found
         assert str(owner) in not_read.found
+        assert shlex.split(not_read.advice)[:2] == ["--config", str(places["user"])]
     assert settings_files(places["user"]) == SettingsFiles((places["user"],))
 
 
