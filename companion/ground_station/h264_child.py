@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 import struct
 import sys
 import threading
@@ -18,7 +19,10 @@ HEADER = struct.Struct("<BI")
 """Number of the stream, bytes of the image."""
 EXIT_REFUSED, EXIT_PASSING = 2, 75
 MAX_CONNECTIONS, MAX_VIEWERS = 16, 8
+UNREAD_S, SILENT_S = 10, 60
+"""A player that takes nothing, and a connection without life, ends after this; as in `rtsp`."""
 PACKAGES = "python3-gi gir1.2-gst-rtsp-server-1.0 gstreamer1.0-plugins-base -good -bad"
+_SEND_BUFFER_BYTES = 128 * 1024
 _BITRATE, _KEY_FRAME_EVERY = 2_000_000, 15
 _TRIAL_S = 5
 # JPEG has the full range of values, which players do not expect of H.264. From I420 to I420 it would stay.
@@ -121,6 +125,15 @@ def _on_client(_server: Any, client: Any, clients: set[Any]) -> None:
         return
     clients.add(client)
     client.connect("closed", clients.discard)
+    # GStreamer leaves such connections open, until there are too many: the kernel ends them.
+    connection = client.get_connection().get_read_socket()
+    connection.set_keepalive(True)
+    for level, name, value in (
+        (socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES),
+        (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * UNREAD_S),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, SILENT_S),
+    ):
+        connection.set_option(level, name, value)
 
 
 def _read(frames: BinaryIO, sources: dict[int, Any], gst: Any) -> None:

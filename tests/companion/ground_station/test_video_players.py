@@ -101,7 +101,8 @@ class H264Stream:
             one kept the loop, seconds.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, image: Callable[[int], bytes] = numbered_jpeg) -> None:
+        self._image = image
         self.said, self.wanted = list[str](), list[bool]()
         self.pushes, self.longest_push_s = 0, 0.0
         self.server = H264Server(
@@ -126,7 +127,7 @@ class H264Stream:
     async def push(self) -> None:
         for count in range(1_000_000):
             begun_s = time.monotonic()
-            self.server.push("front", numbered_jpeg(count % 256), 0)
+            self.server.push("front", self._image(count % 256), 0)
             self.longest_push_s = max(self.longest_push_s, time.monotonic() - begun_s)
             self.pushes += 1
             await asyncio.sleep(1 / RATE_HZ)
@@ -139,9 +140,11 @@ async def until(condition: Callable[[], object], timeout_s: float = 60.0) -> Non
 
 
 @asynccontextmanager
-async def h264_stream(*, lines: int = 0) -> AsyncIterator[H264Stream]:
+async def h264_stream(
+    image: Callable[[int], bytes] = numbered_jpeg, *, lines: int = 0
+) -> AsyncIterator[H264Stream]:
     """`lines`: how many it says in the end."""
-    stream = H264Stream()
+    stream = H264Stream(image)
     await stream.server.start()
     pushing = asyncio.create_task(stream.push())
     try:
@@ -184,6 +187,35 @@ async def test_h264_plays_beside_a_viewer_that_stopped_reading() -> None:
             assert skipped(await shown(player, IMAGES, 6.0)) <= IMAGES // 3
             assert stream.wanted == [True]
         await until(lambda: not stream.wanted[-1], 30.0)
+
+
+def busy_jpeg(number: int) -> bytes:
+    """An image that costs many bits: what waits for a viewer is soon much."""
+    blocks = np.random.default_rng(number).integers(0, 255, (HEIGHT // 4, WIDTH // 4, 3), np.uint8)
+    return cv2.imencode(".jpg", cv2.resize(blocks, (WIDTH, HEIGHT)))[1].tobytes()
+
+
+@pytest.mark.slow
+@pytest.mark.needs("GStreamer")
+async def test_h264_viewer_that_stopped_reading_is_disconnected() -> None:
+    async with (
+        h264_stream(busy_jpeg) as stream,
+        ffmpeg(stream.uri, "tcp") as stopped,
+        ffmpeg(stream.uri, "tcp") as player,
+    ):
+        await asyncio.gather(stopped.image(), player.image())
+        assert connections(stream.server.port) == 2
+        stopped.process.send_signal(signal.SIGSTOP)
+        async with asyncio.timeout(60.0):
+            while connections(stream.server.port) == 2:
+                await player.image()
+        assert stream.wanted == [True]
+
+
+def connections(port: int) -> int:
+    """How many connections of TCP a server on this computer has."""
+    rows = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()]
+    return sum(row[1].endswith(f":{port:04X}") and row[3] == "01" for row in rows)  # TCP_ESTABLISHED
 
 
 @pytest.mark.needs("GStreamer")
