@@ -84,6 +84,8 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
                 host.run(command)
 
     do([*_preparing(host), *_freeing(host, settings, say)])
+    if changed and not dry_run and not force:
+        check_not_flying(host)  # again: that took seconds, in which a vehicle can be armed
     # Last: after an installation that was interrupted, the next one sees the other version, and restarts.
     for entry in changed:
         if not dry_run and isinstance(entry, Link):

@@ -185,6 +185,24 @@ def test_armed_vehicle_is_not_left(
             assert not computer.commands
 
 
+def test_vehicle_that_is_armed_meanwhile_is_not_left(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computer.install()
+    computer.version(NEW)
+    computer.commands.clear()
+    computer.states[UNIT] = "ActiveState=active"
+
+    def find(*_: object) -> Found:
+        return Found(service({"vehicle.armed": ("systemctl", "daemon-reload") in computer.commands}))
+
+    monkeypatch.setattr(flight, "find_service", find)
+    with pytest.raises(SetupError, match="--force"):
+        computer.install()
+    assert not any("restart" in words for words in computer.commands)
+    assert (computer.root / CURRENT.relative_to("/")).readlink() == OLD
+
+
 def test_silent_service_is_not_taken_for_disarmed(
     computer: Computer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
