@@ -13,7 +13,6 @@ from companion.setup.files import SYSTEM_UNITS, UNIT, below
 
 _INSTANCES = "companion@*.service"
 _LONGEST_S = 90.0  # of a stop: TimeoutStopSec of the unit, and a margin
-_NO_MANAGER = "; systemd has a manager for users that are logged in: log in as this user, not by su or sudo"
 
 
 class SetupError(Exception):
@@ -37,8 +36,7 @@ def run_program(command: Sequence[str]) -> str:
         raise SetupError(f"{' '.join(command)}: no end yet, given up") from error
     if done.returncode:
         said = (done.stderr or done.stdout).strip().splitlines() or [f"exit code {done.returncode}"]
-        advice = _NO_MANAGER if "--user" in command and "connect to bus" in said[-1] else ""
-        raise SetupError(f"{' '.join(command)}: {said[-1]}{advice}")
+        raise SetupError(f"{' '.join(command)}: {said[-1]}")
     return done.stdout
 
 
