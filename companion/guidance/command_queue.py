@@ -11,7 +11,7 @@ battery, or the end of the service. The mode in the first heartbeat after a stan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from companion.guidance.behaviour import Behaviour, BehaviourContext, Outcome, Requirement
 from companion.guidance.behaviours.land import LandBehaviour
@@ -110,6 +110,10 @@ class CommandQueue:
         due, left = list[CommandInput](), list[_Waiting]()
         for waiting in self.waiting:
             awaited = _awaited(waiting.command, context)
+            if awaited != waiting.awaited:
+                waiting = replace(waiting, awaited=awaited)
+                if awaited == _GIMBAL:
+                    self._gimbal.find(out)
             found = not awaited or (awaited == _GIMBAL and self._gimbal.not_found)
             if found or now_ns > waiting.until_ns:
                 due.append(waiting.command)

@@ -12,10 +12,11 @@ from companion.guidance.behaviours.land import LandBehaviour, ReturnBehaviour
 from companion.guidance.behaviours.stop import StopBehaviour
 from companion.guidance.behaviours.takeoff import TakeoffBehaviour
 from companion.guidance.gimbal.controller import FIND_TIMEOUT_S
-from companion.guidance.interface import EventKind, GuidanceInput
+from companion.guidance.interface import EventKind, FindGimbal, GuidanceInput, Request
 from companion.vehicle.state import FlightMode
 from companion.vehicle.vehicle_type import ARDUPILOT, PX4, VTOL_STATE_MISSING, VtolState
 from tests.companion.guidance.guidance_harness import GuidanceHarness, assert_failed, engaged, flying, parked
+from tests.companion.guidance.test_command_queue import NeedsGimbal
 
 FIXED_WING, QUADROTOR, ROVER, TILTROTOR = 1, 2, 10, 21
 Identity = tuple[str, int, int, VtolState | None]
@@ -122,6 +123,26 @@ def test_command_is_refused_while_the_type_stays_unknown() -> None:
     outcome = harness.outcome(harness.command("takeoff 3"), FIND_TIMEOUT_S + 0.5)
     assert (outcome.success, outcome.reason) == (False, VTOL_STATE_MISSING)
     assert harness.autopilot.requests == []
+
+
+def test_gimbal_is_requested_once_the_type_is_known() -> None:
+    harness = Vehicle(UNKNOWN)
+    found, start = list[Request](), harness.autopilot.start
+
+    def started(request: Request) -> None:
+        if isinstance(request.action, FindGimbal):
+            found.append(request)
+        else:
+            start(request)
+
+    harness.autopilot.start = started  # type: ignore[method-assign]
+    harness.run(0.1)
+    harness.command(NeedsGimbal())
+    harness.run(0.5)
+    assert not found
+    harness.identity = COPTER
+    harness.run(0.5)
+    assert len(found) == 1
 
 
 def test_pilots_mode_supersedes_a_command_that_waits_for_the_type() -> None:
