@@ -105,6 +105,7 @@ class BehaviourContext:
         planned: the newest path around obstacles, of any age; None: none received.
         avoiding: paths around obstacles are flown (`guidance.avoid`): return `RoutedSetpoint`.
         sent: the last setpoint after the envelope; None before the first.
+        held_at_height: a limit of height acted on it.
         neighbourhood: the other vehicles; None: poses are not shared.
         min_separation_m: minimum distance to each of them.
         markers: detected markers of cameras that look down, or why there can be none.
@@ -148,6 +149,7 @@ class BehaviourContext:
     parameters: AutopilotParameters = NOTHING_READ
     objects: ObjectsInView = field(default_factory=ObjectsInView)
     below: ObjectsInView = field(default_factory=ObjectsInView)
+    held_at_height: bool = False
 
     def perception_fault(self, default: str) -> str:
         """Why targets cannot be used, in words; `default` where neither gimbal nor camera is the reason."""

@@ -277,6 +277,7 @@ class Guidance:
             velocities=inputs.velocities,
             camera_fault=inputs.camera_fault,
             parameters=inputs.parameters,
+            held_at_height=self.setpoints.held_at_height,
         )
         context = self._without_wrong_cameras(context)
         # What a camera shows that is not used is not remembered either.

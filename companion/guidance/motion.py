@@ -47,7 +47,6 @@ SETTLED = ((ARRIVED_M, ARRIVED_MPS, 1.0), (0.8, 0.8, 4.0))
 # A goal at a limit of height counts as reached from here. The envelope allows 0.8 m/s per metre that is left
 # (FENCE_GAIN_PER_S): with an estimate of the vertical speed that is wrong by 0.8 m/s the vehicle stops there.
 AT_LIMIT_M = 1.0
-_CUT_MPS = 0.05
 
 
 def position_and_yaw(state: VehicleState) -> tuple[Vector3, float]:
@@ -133,17 +132,6 @@ def stopping_point(state: VehicleState) -> Vector3:
 def speed_of(state: VehicleState) -> float:
     """Speed in all three axes, m/s; 0 while the velocity is unknown."""
     return math.hypot(*(state.velocity_ned_mps or (0.0,)))
-
-
-def held_at_height(asked_down_mps: float, sent: Setpoint | None) -> bool:
-    """Whether a limit of height keeps the vehicle from climbing or descending as asked.
-
-    Args:
-        asked_down_mps: of the behaviour. sent: the same setpoint after the envelope; None: none was sent.
-    """
-    if sent is None or sent.velocity_ned_mps is None:
-        return False
-    return abs(asked_down_mps) - abs(sent.velocity_ned_mps[2]) > _CUT_MPS
 
 
 class PositionController:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from companion.guidance.avoidance import Avoidance
 from companion.guidance.behaviour import BehaviourContext, Outcome, RoutedSetpoint
 from companion.guidance.interface import EventKind, OutputCollector
-from companion.guidance.limits.envelope import Envelope, Limits, within_autopilot
+from companion.guidance.limits.envelope import Envelope, Limits, is_of_height, within_autopilot
 from companion.guidance.limits.obstacles import Constraint, ObstacleMemory, ObstacleRules
 from companion.guidance.motion import VelocityBias
 from companion.vehicle.autopilot_parameters import NOTHING_READ, AutopilotParameters
@@ -61,6 +61,11 @@ class SetpointOutput:
     def limits(self) -> Limits:
         """The limits of setpoints: the operator's, within the autopilot's."""
         return self._envelope.limits
+
+    @property
+    def held_at_height(self) -> bool:
+        """Whether a limit of height acts: the last setpoint was to climb or descend faster than sent."""
+        return any(map(is_of_height, self.limited_by))
 
     def use_autopilot(self, read: AutopilotParameters) -> None:
         """Keep setpoints within the autopilot's own limits of speed; report once what they reduce."""

@@ -21,7 +21,6 @@ from companion.guidance.motion import (
     Standing,
     add_velocity_error,
     ground_speed,
-    held_at_height,
     in_degrees,
     position_and_yaw,
     speed_of,
@@ -79,7 +78,6 @@ class PathFlight(Behaviour):
         self._yaw_rad: float | None = None
         self._best_m = -math.inf
         self._best_ns = 0
-        self._down_mps = 0.0  # asked for in the update before
         self._standing: Standing | None = None
         self._arrival, self._controller = Arrival(), PositionController()
 
@@ -109,7 +107,7 @@ class PathFlight(Behaviour):
     def resume(self, context: BehaviourContext) -> None:
         """The next `update` continues the path after an interruption."""
         self._standing = None
-        self._best_m, self._best_ns, self._down_mps = -math.inf, context.now_ns, 0.0
+        self._best_m, self._best_ns = -math.inf, context.now_ns
         self._arrival, self._controller = Arrival(), PositionController()
 
     def stand(self, dt_s: float, context: BehaviourContext, yaw_rad: float | None = None) -> Setpoint:
@@ -131,8 +129,7 @@ class PathFlight(Behaviour):
         aligned = self._heading_rad is None or abs(wrap_angle(self._heading_rad - yaw_rad)) <= HEADING_RAD
         arrived = self._arrival.update(away_m, speed_of(state), now_ns)
         stuck = self._stuck(follower, now_ns, AVOIDING_STUCK_S if context.avoiding else STUCK_S)
-        stays_m = AT_LIMIT_M if held_at_height(self._down_mps, context.sent) else STAYS_M
-        if aligned and (arrived or (stuck and away_m <= stays_m)):
+        if aligned and (arrived or (stuck and self._stays(position, away_m, context))):
             near = away_m <= ARRIVED_M
             text = self._success_text() if near else f"stopped {away_m:.2f} m from the goal"
             return Outcome(True, text, end)
@@ -143,7 +140,6 @@ class PathFlight(Behaviour):
             self._yaw_rad = self._heading_rad
         elif self._nose_along and bearing is not None and follower.left_m > KEEP_NOSE_M:
             self._yaw_rad = bearing
-        self._down_mps = velocity[2]
         if context.avoiding and away_m >= END_M:
             setpoint = Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
             return RoutedSetpoint(setpoint, follower.ahead(ROUTE_M))
@@ -154,8 +150,15 @@ class PathFlight(Behaviour):
                 (velocity[0], velocity[1]), state, SPEED_MARGIN * self._speed_mps
             )
             velocity = (*over_ground, velocity[2])
-        self._down_mps = velocity[2]
         return Setpoint.velocity(velocity, now_ns, yaw_rad=self._yaw_rad)
+
+    def _stays(self, position: Vector3, away_m: float, context: BehaviourContext) -> bool:
+        """Whether it is as near to the end as it gets: nearly there, or below or above it at a limit."""
+        if away_m <= STAYS_M:
+            return True
+        end = None if self._follower is None else self._follower.end_ned_m
+        beside_m = math.inf if end is None else math.dist(end[:2], position[:2])
+        return context.held_at_height and beside_m <= STAYS_M and away_m <= AT_LIMIT_M
 
     def _stuck(self, follower: PathFollower, now_ns: int, stuck_s: float) -> str | None:
         """The reason if there was no progress for so long; None: there was."""

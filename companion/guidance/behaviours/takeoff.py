@@ -25,7 +25,6 @@ from companion.guidance.motion import (
     POSITION_GAIN,
     Lasting,
     PositionController,
-    held_at_height,
     towards,
 )
 from companion.vehicle.autopilot_parameters import DEFAULT_ACCEPTANCE_M
@@ -73,7 +72,6 @@ class TakeoffBehaviour(Behaviour):
         self._controller = PositionController()
         self._altitude_now_m = 0.0
         self._low = False
-        self._down_mps = 0.0  # asked for in the update before
 
     @property
     def requirements(self) -> frozenset[Requirement]:  # type: ignore[override]
@@ -113,7 +111,7 @@ class TakeoffBehaviour(Behaviour):
         if self._there.held_s(there, now_ns) >= THERE_S:
             return self._success(state, missing_m)
         if now_ns > self._until_ns:
-            if still and abs(missing_m) <= AT_LIMIT_M and held_at_height(self._down_mps, context.sent):
+            if still and abs(missing_m) <= AT_LIMIT_M and context.held_at_height:
                 return self._success(state, missing_m)
             return Outcome(
                 False, f"take-off timed out: {self._altitude_now_m:.1f} m of {self._altitude_m:g} m reached"
@@ -131,7 +129,6 @@ class TakeoffBehaviour(Behaviour):
         standing = state.landed is LandedState.ON_GROUND  # what moves then is the estimate
         self._top = self._above(state, missing_m, None if standing else self._top)
         *_, down_mps = self._controller.velocity(self._top, state, dt_s, CLIMB_MPS)
-        self._down_mps = down_mps
         sideways_mps = towards(self._top, state.position_ned_m or self._top, POSITION_GAIN, SIDEWAYS_MPS)
         return Setpoint.velocity((*sideways_mps, down_mps), now_ns, yaw_rad=self._yaw_rad)
 

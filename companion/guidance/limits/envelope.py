@@ -43,6 +43,8 @@ FEED_FORWARD_PER_S = 1.0
 FEED_FORWARD_FADES_MPS = 0.3
 # Heights that differ by less count as equal.
 SAME_HEIGHT_M = 0.05
+# Begins the reasons of the limits of height.
+_ALTITUDE = "altitude"
 # Part of the maximum acceleration that is planned for stopping at a fence; the rest covers delay.
 FENCE_BRAKING = 0.5
 # Delay of a multirotor's velocity response.
@@ -114,6 +116,11 @@ def within_autopilot(limits: Limits, read: AutopilotParameters) -> tuple[Limits,
     if not changes:
         return limits, ""
     return replace(limits, **changes), f"speed limited by the autopilot: {', '.join(words)}"
+
+
+def is_of_height(reason: str) -> bool:
+    """Return whether a reason of `Limited` is a limit of height."""
+    return reason.startswith(_ALTITUDE)
 
 
 class Limited(NamedTuple):
@@ -312,10 +319,10 @@ class Envelope:
             descend_mps = least.of(descend_mps, sent_down)
         if down < -climb_mps:
             down = -climb_mps
-            reasons.append(f"altitude limited to {limits.max_altitude_m:g} m")
+            reasons.append(f"{_ALTITUDE} limited to {limits.max_altitude_m:g} m")
         elif not self._landing and down > descend_mps:
             down = descend_mps
-            reasons.append(f"altitude kept above {limits.min_altitude_m:g} m")
+            reasons.append(f"{_ALTITUDE} kept above {limits.min_altitude_m:g} m")
         home = state.home_position_ned_m or (0.0, 0.0, 0.0)
         away = (state.position_ned_m[0] - home[0], state.position_ned_m[1] - home[1])
         distance_m = math.hypot(*away)

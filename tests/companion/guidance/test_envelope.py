@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.geometry.fence import Fence
-from companion.guidance.limits.envelope import Envelope, Limits
+from companion.guidance.limits.envelope import Envelope, Limits, is_of_height
 from companion.vehicle.setpoint import Setpoint
 from companion.vehicle.state import Vector3, VehicleState
 from tests.companion.guidance.guidance_harness import known
@@ -212,6 +212,23 @@ def test_velocity_along_or_away_from_the_fence_is_kept() -> None:
     assert back.velocity_ned_mps == pytest.approx((-3.0, 0.0, 0.0))
     along, _ = settled(Envelope(LIMITS), Setpoint.velocity((1.0, 3.0, 0.0), NOW), state)
     assert along.velocity_ned_mps == pytest.approx((0.0, 3.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("asked", "height_m", "of_height"),
+    [
+        ((0.0, 0.0, -2.0), 49.9, True),  # a climb, below the maximum
+        ((0.0, 0.0, 1.0), 1.1, True),
+        ((0.0, 0.0, -1.0), 30.0, False),
+        ((9.0, 0.0, -4.0), 30.0, False),  # too fast: its climb is cut too
+        ((9.0, 0.0, 0.0), 49.9, False),
+    ],
+)
+def test_limits_of_height_differ_from_others(asked: Vector3, height_m: float, of_height: bool) -> None:
+    state = vehicle((0.0, 0.0, -height_m))
+    limited, reasons = settled(Envelope(LIMITS), Setpoint.velocity(asked, NOW), state)
+    assert any(map(is_of_height, reasons)) is of_height
+    assert (known(limited.velocity_ned_mps) != asked) is (asked != (0.0, 0.0, -1.0))
 
 
 def test_fence_is_centred_on_home() -> None:
