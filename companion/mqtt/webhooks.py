@@ -19,7 +19,9 @@ from vision.redaction import redacted
 MOST_EVENTS, MOST_BYTES = 100, 16 * 1024 * 1024
 _TIMEOUT_S = 10.0
 _PAUSES_S = (1.0, 5.0, 25.0)
-_SAY_INTERVAL_S = 600.0
+_SAY_INTERVAL_S, _OTHER_FAULT_S = 600.0, 10.0
+# So long without a failure, and a fault has ended.
+_CALM_S = 10.0
 _TOO_MANY_REQUESTS, _SERVER_ERROR = 429, 500
 
 
@@ -30,15 +32,16 @@ class Webhook:
     final. Of events that wait the oldest are left out, and counted.
 
     Args:
-        say: called with a line when a fault begins, changes or ends, and every 10 minutes meanwhile if events
-            were lost.
+        say: called with a line when a third attempt has failed or events were lost, every 10 minutes while
+            that goes on, and when all that waited was posted.
     """
 
     def __init__(self, url: str, say: Callable[[str], None], pauses_s: tuple[float, ...] = _PAUSES_S) -> None:
         self._url, self._say, self._pauses_s = url, say, pauses_s
         self._events: deque[tuple[str, bytes]] = deque()
         self._waiting = asyncio.Event()
-        self._fault, self._lost, self._said_s = "", 0, -math.inf
+        self._fault, self._lost = "", 0  # that was said; events lost since
+        self._said_s = self._failed_s = -math.inf
 
     def put(self, event_id: str, body: bytes) -> None:
         """Post an event as soon as possible."""
@@ -76,24 +79,27 @@ class Webhook:
             if not again or pause_s is None:
                 self._lose(why)
                 return
+            self._failed_s = time.monotonic()
             if number == len(self._pauses_s) - 1:  # it lasts
                 self._note(f"{why}; retrying", why)
             await asyncio.sleep(pause_s)
 
     def _lose(self, why: str) -> None:
         self._lost += 1
+        self._failed_s = time.monotonic()
         self._note(f"{why}; {self._lost} events were not delivered", why)
 
     def _note(self, text: str, why: str) -> None:
         now_s = time.monotonic()
-        if why != self._fault or (self._lost and now_s - self._said_s >= _SAY_INTERVAL_S):
+        if now_s - self._said_s >= (_SAY_INTERVAL_S if why == self._fault else _OTHER_FAULT_S):
             self._fault, self._said_s = why, now_s
             self._say(f"webhook {redacted(self._url)}: {text}")
 
     def _recovered(self) -> None:
-        if self._fault:
+        now_s = time.monotonic()
+        if self._fault and not self._events and now_s - self._failed_s >= _CALM_S:
             self._say(f"webhook {redacted(self._url)}: posting again; {self._lost} events were not delivered")
-        self._fault, self._lost = "", 0
+            self._fault, self._lost, self._said_s = "", 0, now_s
 
 
 def _reason(error: httpx.HTTPError) -> str:

@@ -85,7 +85,11 @@ def test_events_are_posted_in_order_and_again_until_they_are_taken() -> None:
 
 
 @pytest.mark.parametrize(("status", "tries"), [(404, 1), (302, 1), (500, 4)])
-def test_another_status_is_final_and_a_fault_is_tried_four_times(status: int, tries: int) -> None:
+def test_another_status_is_final_and_a_fault_is_tried_four_times(
+    status: int, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhooks, "_CALM_S", 0.0)
+
     async def work(webhook: Webhook, server: Server) -> None:
         webhook.put("a", b"1")
         webhook.put("b", b"2")
@@ -98,7 +102,9 @@ def test_another_status_is_final_and_a_fault_is_tried_four_times(status: int, tr
     assert len(said) == 2
 
 
-def test_a_fault_is_said_when_it_begins_and_when_it_ends() -> None:
+def test_a_fault_is_said_when_it_begins_and_when_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(webhooks, "_CALM_S", 0.0)
+
     async def work(webhook: Webhook, server: Server) -> None:
         for number in range(4):
             webhook.put(str(number), b"{}")
@@ -107,6 +113,20 @@ def test_a_fault_is_said_when_it_begins_and_when_it_ends() -> None:
     said = with_server(lambda number: 500 if number <= 12 else 204, work)
     assert len(said) == 2
     assert said[1].endswith("posting again; 3 events were not delivered")
+
+
+@pytest.mark.parametrize("status", [400, None])
+def test_a_server_that_takes_every_other_event_is_said_once(
+    status: int | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(webhooks, "_TIMEOUT_S", 0.05)
+
+    async def work(webhook: Webhook, server: Server) -> None:
+        for number in range(MOST_EVENTS + 1):  # the first is too much
+            webhook.put(str(number), b"{}")
+        await wait_for(server, 60)
+
+    assert len(with_server(lambda number: 204 if number % 2 else status, work)) == 1
 
 
 def test_nobody_listening_is_called_so() -> None:
