@@ -132,6 +132,7 @@ def _on_client(_server: Any, client: Any, clients: set[Any]) -> None:
         (socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES),
         (socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * UNREAD_S),
         (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, SILENT_S),
+        (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, UNREAD_S),
     ):
         connection.set_option(level, name, value)
 
