@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -22,6 +21,7 @@ from companion.ground_station.component import (
     RequestTable,
 )
 from companion.ground_station.positions import Place, Positions
+from companion.host.clock import unix_offset_ns
 
 COMPONENT_IDS = range(mavlink.MAV_COMP_ID_CAMERA, mavlink.MAV_COMP_ID_CAMERA6 + 1)
 VENDOR = "companion"
@@ -380,7 +380,7 @@ class Camera:
             orientation = self.positions.orientation(photo.captured_ns)
         message = mavlink.MAVLink_camera_image_captured_message(
             photo.captured_ns // 1_000_000 & 0xFFFF_FFFF,
-            max(time.time_ns() - time.monotonic_ns() + photo.captured_ns, 0) // 1000,
+            max(unix_offset_ns() + photo.captured_ns, 0) // 1000,
             0,
             *_coordinates(place),
             orientation or _NO_ORIENTATION,

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 from uuid import uuid4
+
+from companion.host.clock import unix_offset_ns
 
 UPDATE_INTERVAL_S = 1.0
 SNAPSHOT_WAIT_S = 1.0
@@ -61,7 +62,7 @@ class ObjectEvents:
     def __init__(
         self,
         want_image: Callable[[str | None, bool], None],
-        unix_offset_ns: Callable[[], int] = lambda: time.time_ns() - time.monotonic_ns(),
+        unix_offset_ns: Callable[[], int] = unix_offset_ns,
     ) -> None:
         self._want_image, self._unix_offset_ns = want_image, unix_offset_ns
         self._objects: dict[tuple[str | None, str], _Seen] = {}

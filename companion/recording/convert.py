@@ -36,6 +36,7 @@ from companion.bus.topics import (
     VEHICLE,
     Topic,
 )
+from companion.host.clock import unix_offset_ns
 from companion.host.peer_data import parse_object
 from companion.recording.files import Channel, Recorded
 from companion.recording.foxglove_schemas import SCHEMAS
@@ -111,7 +112,7 @@ class Converter:
     def __init__(self, vehicle: str) -> None:
         self._vehicle = vehicle
         # Of this host, until the service's own is received; both are equal on one host.
-        self._offset_ns = time.time_ns() - time.monotonic_ns()
+        self._offset_ns = unix_offset_ns()
         self._preview_width = 0
         self._has_path = False
         self._down_m = 0.0  # of the vehicle: a path around obstacles is level
