@@ -169,7 +169,8 @@ def check_alive(session: zenoh.Session, vehicle: str) -> None:
 
 def _no_service(vehicle: str) -> NoAnswerError:
     return NoAnswerError(
-        f"no service for vehicle {vehicle!r}: check vehicle.name; `companion echo status` lists the services"
+        f"no service for vehicle {vehicle!r}: check vehicle.name; `companion echo 'companion/*/status'` "
+        "lists the services"
     )
 
 

@@ -157,9 +157,10 @@ def echo(
         bool, typer.Option("--history", help="Begin with kept messages: events, tracks, status, camera_info.")
     ] = False,
 ) -> None:
-    """Print the messages of the running services, or of that of vehicle.name if it is given.
+    """Print the messages of running services.
 
-    One line each: key and message. A key that begins with companion/ names the vehicle itself.
+    Of all, or of that of vehicle.name if it is given. One line each: key and message. A key that begins
+    with companion/ names the vehicle itself.
     """
     import queue
 
