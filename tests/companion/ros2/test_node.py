@@ -53,7 +53,7 @@ STRING, TWIST = "std_msgs/msg/String", "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 TWIST_MPS = 2.0
 # Of guidance and of the setpoint stream together, by default; and what a busy computer adds.
-PERIOD_S, LATE_S = 1 / 20 + 1 / 50, 0.1
+PERIOD_S, LATE_S = 1 / 20 + 1 / 50, 0.5
 LENS = {
     "stamp_ns": 0,
     "frame_id": "drone1/camera",
