@@ -18,6 +18,8 @@ SYSTEM_PYTHON = "/usr/bin/python3"
 """Debian's gi is built for it alone."""
 UNTAKEN_S = 10.0
 """A child that takes no image for this long is killed, and started again."""
+# A longer time between two images counts as this: the process may have been stopped, and has written nothing.
+_LONGEST_GAP_S = 1.0
 _NAME = "H.264"
 _END_S = 1.0  # it has nothing to finish, and the end of this process must not wait for it
 
@@ -51,7 +53,7 @@ class H264Server:
         self._on_wanted, self._say, self._python = on_wanted, say, python
         self.is_ready = False
         self._wanted: set[str] = set()
-        self._taken_s = 0.0
+        self._pushed_s = self._untaken_s = 0.0
         self._process: Process | None = None
         self._stack = AsyncExitStack()
 
@@ -73,13 +75,17 @@ class H264Server:
         if stream not in self._wanted or (process := self._process) is None:
             return
         assert process.stdin is not None
+        now_s = time.monotonic()
+        gap_s, self._pushed_s = now_s - self._pushed_s, now_s
         if not process.stdin.transport.get_write_buffer_size():
-            self._taken_s = time.monotonic()
+            self._untaken_s = 0.0
             number = list(self.paths).index(stream)
             process.stdin.write(h264_child.HEADER.pack(number, len(jpeg)) + jpeg)
-        elif time.monotonic() - self._taken_s > UNTAKEN_S:
+            return
+        self._untaken_s += min(gap_s, _LONGEST_GAP_S)
+        if self._untaken_s > UNTAKEN_S:
             self._say(f"{_NAME}: no sign of life for {UNTAKEN_S:g} s")
-            self._set_wanted(stream, False)  # once
+            self._process = None  # once
             with suppress(ProcessLookupError):
                 process.kill()
 
@@ -94,7 +100,7 @@ class H264Server:
         assert process.stdin is not None
         options = {"host": self.host, "port": self.port, "paths": self.paths}
         process.stdin.write(json.dumps(options).encode() + b"\n")  # not an argument: others can read those
-        self._process = process
+        self._process, self._untaken_s = process, 0.0
         return process, process.stdin.close
 
     def _on_line(self, line: str) -> None:

@@ -10,17 +10,20 @@ import socket
 import subprocess
 import sys
 import time
+from asyncio.subprocess import Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
 
 from companion.ground_station import h264_child, rtsp
-from companion.ground_station.gstreamer import H264Server
+from companion.ground_station.gstreamer import UNTAKEN_S, H264Server
 from companion.ground_station.rtsp import VideoServer
 from mavlink_sim.testing import free_port
 from tests.companion.ground_station.rtsp_client import number_of, numbered_jpeg, push_images
@@ -243,6 +246,36 @@ async def test_h264_child_that_dies_or_hangs_is_replaced(
         assert "-9" in stream.said[-1]
         async with ffmpeg(stream.uri, "tcp") as player:
             await shown(player, 5, 6.0)
+
+
+class UntakingProcess:
+    """A process that takes nothing. `kills`: how often it was killed."""
+
+    def __init__(self) -> None:
+        self.kills = 0
+        self.stdin = SimpleNamespace(transport=SimpleNamespace(get_write_buffer_size=lambda: 1))
+
+    def kill(self) -> None:
+        self.kills += 1
+
+
+@pytest.mark.parametrize(("gap_s", "kills"), [(0.0, 0), (3600.0, 0), (None, 1)])
+def test_h264_child_is_killed_once_and_not_for_a_pause(
+    monkeypatch: pytest.MonkeyPatch, gap_s: float | None, kills: int
+) -> None:
+    now_s, said, process = 1000.0, list[str](), UntakingProcess()
+    monkeypatch.setattr("companion.ground_station.gstreamer.time.monotonic", lambda: now_s)
+    server = H264Server(
+        "127.0.0.1", 0, ["front", "rear"], token=None, on_wanted=lambda *_: None, say=said.append
+    )
+    server._process = cast(Process, process)
+    for stream in server.paths:
+        server._on_line(f"H.264: wanted {stream} 1")
+    for _ in range(int(20 * UNTAKEN_S) if gap_s is None else 2):
+        now_s += 0.1 if gap_s is None else gap_s
+        for stream in server.paths:
+            server.push(stream, b"", 0)
+    assert (process.kills, len(said)) == (kills, kills)
 
 
 @pytest.mark.needs("GStreamer")
