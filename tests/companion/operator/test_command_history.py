@@ -60,7 +60,7 @@ def test_without_a_file_the_lines_are_those_of_this_console(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("foreign", ["home", "home/console_history"])
-def test_nothing_is_written_in_the_place_of_another_user(
+def test_root_writes_nothing_in_the_place_of_another_user(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, foreign: str
 ) -> None:
     (tmp_path / "home").mkdir()
@@ -70,15 +70,32 @@ def test_nothing_is_written_in_the_place_of_another_user(
     lstat = Path.lstat
 
     def other(each: Path) -> os.stat_result:
+        uid = 65534 if each == tmp_path / foreign else 0
         found = list(lstat(each))
-        return os.stat_result([*found[:4], 65534, *found[5:]]) if each == tmp_path / foreign else lstat(each)
+        return os.stat_result([*found[:4], uid, *found[5:]])
 
     monkeypatch.setattr(Path, "lstat", other)
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
     history = CommandHistory(path)
     with pytest.raises(PermissionError, match="another user"):
         history.add("hold")
     about = (tmp_path / "elsewhere").stat()
     assert (about.st_size, stat.S_IMODE(about.st_mode)) == (0, 0o644)
+
+
+def test_history_is_kept_where_the_root_folder_is_nobodys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lstat = Path.lstat
+
+    def of_nobody(each: Path) -> os.stat_result:
+        found = list(lstat(each))
+        return os.stat_result([*found[:4], 65534, *found[5:]])
+
+    monkeypatch.setattr(Path, "lstat", of_nobody)
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    CommandHistory(tmp_path / "history").add("hold")
+    assert CommandHistory(tmp_path / "history").lines() == ["hold"]
 
 
 def test_cut_line_is_no_command(tmp_path: Path) -> None:
