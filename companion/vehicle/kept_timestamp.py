@@ -107,16 +107,21 @@ class KeptTimestamp:
             folder = os.open(self.path.parent, os.O_RDONLY | os.O_DIRECTORY)
             try:
                 fcntl.flock(folder, fcntl.LOCK_EX)  # another program that signs keeps its own there
-                with contextlib.suppress(OSError, ValueError):
-                    if self._read() >= timestamp:
-                        return
-                self._replace(timestamp)
-                os.fsync(folder)
+                if not self._has(timestamp):
+                    self._replace(timestamp)
+                    os.fsync(folder)
                 self.problem = ""
             finally:
                 os.close(folder)
         except OSError as error:
             self._fail("cannot be written", error)
+
+    def _has(self, timestamp: int) -> bool:
+        """Whether the file has this timestamp or a later one, of another program."""
+        try:
+            return self._read() >= timestamp
+        except (OSError, ValueError):
+            return False
 
     def _replace(self, timestamp: int) -> None:
         descriptor, draft = tempfile.mkstemp(prefix=f".{FILE_NAME}-", dir=self.path.parent)
@@ -134,10 +139,9 @@ class KeptTimestamp:
     def _fail(self, what: str, error: Exception) -> None:
         reason = (error.strerror if isinstance(error, OSError) else None) or str(error)
         said, self.problem = self.problem, f"{what}: {reason}"
-        if not said.endswith(f": {reason}"):
+        if said != self.problem:
             logger.warning(
-                "signing timestamp %s: %s: %s; a start with a late clock will accept old messages",
+                "signing timestamp %s: %s; a start with a late clock will accept old messages",
                 self.path,
-                what,
-                reason,
+                self.problem,
             )

@@ -157,7 +157,36 @@ def test_a_folder_that_cannot_be_written_is_said_once(
         set_clock(start_s + 60.0 * minute)
         assert autopilot.accepts(signed(signer))
         kept.flush()
-    assert len(caplog.records) == 1
+    assert len({record.getMessage() for record in caplog.records}) == len(caplog.records) == 2  # read, write
+
+
+def test_a_problem_ends_where_another_program_has_written(tmp_path: Path) -> None:
+    (tmp_path / FILE_NAME).touch()
+    now = timestamp_now()
+    kept, other = KeptTimestamp(tmp_path), KeptTimestamp(tmp_path)
+    assert kept.problem
+    other.passed(now + ONE_MINUTE)
+    other.flush()
+    kept.passed(now)
+    kept.flush()
+    assert kept.problem == ""
+
+
+def test_reading_and_writing_are_two_problems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refused)
+    monkeypatch.setattr(os, "replace", refused)
+    kept = KeptTimestamp(tmp_path)
+    before = kept.problem
+    for minute in (0, 2):
+        kept.passed(timestamp_now() + minute * ONE_MINUTE)
+        kept.flush()
+    assert kept.problem not in ("", before)
+    assert len(caplog.records) == 2
 
 
 def test_a_clock_after_2100_leaves_timestamps_to_go_on(tmp_path: Path, set_clock: SetClock) -> None:
