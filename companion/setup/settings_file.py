@@ -6,6 +6,7 @@ import copy
 import difflib
 import os
 import re
+import secrets
 import shutil
 import stat
 import time
@@ -129,16 +130,20 @@ def write(path: Path, text: str, now_s: float | None = None) -> Path | None:
     path = path.resolve()
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = None
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    former = path.read_bytes() if path.exists() else None
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    _create(partial, text.encode(), like=path)
     try:
-        if path.exists():
-            kept = _free_name(path, time.time() if now_s is None else now_s)
-            _create(kept, path.read_bytes(), like=path)
+        if former is not None:
+            copied = _free_name(path, time.time() if now_s is None else now_s)
+            _create(copied, former, like=path)
+            kept = copied
             shutil.copystat(path, kept)
-        _create(partial, text.encode(), like=path)
         os.replace(partial, path)
     except BaseException:
-        if kept is not None:
+        if (
+            kept is not None and partial.exists()
+        ):  # else it is at its place, and the copy the only former file
             kept.unlink(missing_ok=True)
         raise
     finally:
@@ -147,21 +152,29 @@ def write(path: Path, text: str, now_s: float | None = None) -> Path | None:
 
 
 def _create(path: Path, data: bytes, *, like: Path) -> None:
-    """Write a new file with owner and mode of another, which may be missing. Never through a link."""
+    """Write a new file with owner and mode of another, which may be missing. Never through a link.
+
+    Raises:
+        OSError: it is there, or cannot be written; then nothing is left of it.
+    """
     former = like.stat() if like.exists() else None
     # The file may have an address with a password: nobody else reads it before it has its mode.
     mode = 0o666 if former is None else 0o600
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
-    with open(descriptor, "wb") as opened:
-        opened.write(data)
-        if former is not None:
-            with suppress(PermissionError):  # another user's file, in a folder of ours
-                os.fchown(descriptor, former.st_uid, former.st_gid)
-            os.fchmod(descriptor, stat.S_IMODE(former.st_mode))
-        elif os.geteuid() == 0:
-            os.fchmod(descriptor, 0o644)  # whatever root's umask is
-        opened.flush()
-        os.fsync(descriptor)
+    try:
+        with open(descriptor, "wb") as opened:
+            opened.write(data)
+            if former is not None:
+                with suppress(PermissionError):  # another user's file, in a folder of ours
+                    os.fchown(descriptor, former.st_uid, former.st_gid)
+                os.fchmod(descriptor, stat.S_IMODE(former.st_mode))
+            elif os.geteuid() == 0:
+                os.fchmod(descriptor, 0o644)  # whatever root's umask is
+            opened.flush()
+            os.fsync(descriptor)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 def _free_name(path: Path, now_s: float) -> Path:

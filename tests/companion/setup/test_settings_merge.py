@@ -13,6 +13,7 @@ import pytest
 
 from companion.settings.layers import SYSTEM_VARIABLE, user_file
 from companion.settings.reading import ConfigurationError
+from companion.setup import settings_file
 from companion.setup.settings_file import MARK, Change, MergeError, difference, merged, write
 from companion.setup.target import check_text, read_target
 
@@ -133,6 +134,35 @@ def test_full_disk_leaves_the_former_file_alone(tmp_path: Path, monkeypatch: pyt
     with pytest.raises(OSError, match="No space"):
         write(path, "second\n")
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("companion.toml", "first\n")]
+
+
+def test_copy_of_another_program_is_not_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path := tmp_path / "companion.toml").write_text("first\n")
+    theirs = tmp_path / "companion.toml.copy"
+    theirs.write_text("theirs\n")
+    monkeypatch.setattr(settings_file, "_free_name", lambda *_: theirs)
+    with pytest.raises(FileExistsError):
+        write(path, "second\n")
+    assert {each.name: each.read_text() for each in tmp_path.iterdir()} == {
+        "companion.toml": "first\n",
+        "companion.toml.copy": "theirs\n",
+    }
+
+
+def test_ctrl_c_after_the_change_leaves_the_copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (path := tmp_path / "companion.toml").write_text("first\n")
+    replace = os.replace
+
+    def interrupted(source: Path, target: Path) -> None:
+        replace(source, target)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "replace", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write(path, "second\n")
+    assert path.read_text() == "second\n"
+    (copy,) = [each for each in tmp_path.iterdir() if each != path]
+    assert copy.read_text() == "first\n"
 
 
 def test_former_file_is_kept_with_its_mode(tmp_path: Path) -> None:
