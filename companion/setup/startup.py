@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from companion.bus.bodies.service import StatusBody
@@ -23,7 +23,8 @@ _JOURNAL_LINES = 15
 _WIDTH = 80
 _UP = ("ready", "finished")
 _AUTOPILOT = "autopilot"
-_EXITED = "1"  # CLD_EXITED; otherwise a signal has ended it
+# Codes of ExecMainCode, as of waitid(2): CLD_EXITED; CLD_KILLED and CLD_DUMPED. 0: no process ran.
+_EXITED, _SIGNALLED = "1", ("2", "3")
 
 
 def starts_at_boot(host: Host) -> bool:
@@ -70,14 +71,22 @@ def _wait_for_systemd(host: Host, unit: str, say: Callable[[str], None], before:
             return None
         restarted = state.get("SubState") == "auto-restart" or state.get("NRestarts") not in (None, "", "0")
         if replaced and (active == "failed" or restarted):
-            by = "with exit code" if state.get("ExecMainCode") in (None, _EXITED) else "by signal"
-            return f"has ended {by} {state.get('ExecMainStatus')}"
+            return f"has ended {_how_it_ended(state)}"
         if waited_s > START_S:
             return f"is still {active}: companion status shows when it is ready"
         if state.get("StatusText", "") != text or waited_s - said_s > _SAID_EVERY_S:
             text, said_s = state.get("StatusText", ""), waited_s
             say(f"waiting    {waited_s:.0f} s: {text or active}")
         time.sleep(_POLL_S)
+
+
+def _how_it_ended(state: Mapping[str, str]) -> str:
+    code, status = state.get("ExecMainCode"), state.get("ExecMainStatus")
+    if code == _EXITED:
+        return f"with exit code {status}"
+    if code in _SIGNALLED:
+        return f"by signal {status}"
+    return f"with the result {state.get('Result')}, and no process"
 
 
 def _say_status(

@@ -87,7 +87,7 @@ class Host:
         """Return the state of a unit, as `systemctl show` names it; of one that is not there too."""
         names = (
             *("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID"),
-            *("ExecMainCode", "ExecMainStatus"),
+            *("ExecMainCode", "ExecMainStatus", "Result"),
         )
         printed = self.run(self.systemctl("show", unit, f"--property={','.join(names)}"))
         return dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)
