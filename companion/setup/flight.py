@@ -25,7 +25,7 @@ def settings_of_unit(host: Host, unit: str) -> Settings:
 def check_not_flying(host: Host) -> None:
     """Raise SetupError if a running service says that its vehicle is armed, or does not say."""
     for unit in host.units():
-        if host.is_active(unit) and (why := _why_not(host, unit)):
+        if host.is_running(unit) and (why := _why_not(host, unit)):
             raise SetupError(f"{unit} would be stopped, and {why}: land and disarm, or add --force")
 
 

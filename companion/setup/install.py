@@ -73,7 +73,7 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
     # Who runs instances alone has disabled the first one.
     starts = not instances or host.show(UNIT).get("UnitFileState") == "enabled"
     watched = [UNIT] if starts else []
-    watched += [unit for unit in instances if changed and host.is_active(unit)]
+    watched += [unit for unit in instances if changed and host.is_running(unit)]
     before = {} if dry_run else {unit: host.show(unit).get("InvocationID") for unit in watched}
     began_s = time.time()
 

@@ -13,6 +13,8 @@ from companion.setup.files import SYSTEM_UNITS, UNIT, below
 
 _INSTANCES = "companion@*.service"
 _LONGEST_S = 90.0  # of a stop: TimeoutStopSec of the unit, and a margin
+UP_OR_STARTING = ("active", "reloading", "activating")
+"""States of a unit that a restart stops. One that has crashed, and is started again soon, is `activating`."""
 
 
 class SetupError(Exception):
@@ -103,6 +105,6 @@ class Host:
         """Return the service's unit, and its instances."""
         return [UNIT, *(() if self.user else self.instances())]
 
-    def is_active(self, unit: str) -> bool:
-        """Whether a unit runs, and is ready."""
-        return self.show(unit).get("ActiveState") in ("active", "reloading", "deactivating")
+    def is_running(self, unit: str) -> bool:
+        """Whether a unit runs: ready, starting, ending, or started again soon after a crash."""
+        return self.show(unit).get("ActiveState") in (*UP_OR_STARTING, "deactivating")

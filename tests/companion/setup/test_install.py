@@ -203,13 +203,15 @@ def test_vehicle_that_is_armed_meanwhile_is_not_left(
     assert (computer.root / CURRENT.relative_to("/")).readlink() == OLD
 
 
+@pytest.mark.parametrize("state", ["active", "activating", "reloading", "deactivating"])
 def test_silent_service_is_not_taken_for_disarmed(
-    computer: Computer, monkeypatch: pytest.MonkeyPatch
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, state: str
 ) -> None:
     monkeypatch.setattr(flight, "find_service", lambda *_: Found())
-    computer.states[UNIT] = "ActiveState=active"
-    with pytest.raises(SetupError, match="--force"):
-        computer.install()
+    computer.states[UNIT] = f"ActiveState={state}"
+    for act in (computer.install, computer.uninstall):
+        with pytest.raises(SetupError, match="--force"):
+            act()
 
 
 @pytest.mark.parametrize(
