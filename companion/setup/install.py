@@ -6,7 +6,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -29,7 +29,7 @@ from companion.setup.files import (
 )
 from companion.setup.flight import check_not_flying, settings_of_unit
 from companion.setup.startup import starts_at_boot, wait_until_up
-from companion.setup.systemctl import Host, SetupError, as_root
+from companion.setup.systemctl import UP_OR_STARTING, Host, SetupError, as_root
 from companion.vehicle.link_url import LinkScheme, parse_link_url
 
 GROUPS = ("dialout", "video")
@@ -65,16 +65,17 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
             check_not_flying(host)
     settings = _settings(host, say)
     changed = [entry for entry in entries if not entry.is_there()]
+    is_new = entries[0].found() is None
     for entry in entries:
         _say_entry(entry, say, whole=dry_run)
-        if not dry_run and entry in changed and not isinstance(entry, Link):
-            entry.write()
     instances = [] if host.user else host.instances()
+    states = {} if dry_run and not instances else {unit: host.show(unit) for unit in (UNIT, *instances)}
     # Who runs instances alone has disabled the first one.
-    starts = not instances or host.show(UNIT).get("UnitFileState") == "enabled"
-    watched = [UNIT] if starts else []
-    watched += [unit for unit in instances if changed and host.is_running(unit)]
-    before = {} if dry_run else {unit: host.show(unit).get("InvocationID") for unit in watched}
+    starts = not instances or states[UNIT].get("UnitFileState") == "enabled"
+    own = [UNIT] if starts else []
+    running = [unit for unit in instances if states[unit].get("ActiveState") in UP_OR_STARTING]
+    # After an installation that was interrupted nothing is changed, and the process is the former one.
+    restarted = [unit for unit in (*own, *running) if changed or _is_outdated(states.get(unit, {}), entries)]
     began_s = time.time()
 
     def do(commands: Iterable[tuple[str, ...]]) -> None:
@@ -83,14 +84,24 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
             if not dry_run:
                 host.run(command)
 
-    do([*_preparing(host), *_freeing(host, settings, say)])
-    if changed and not dry_run and not force:
-        check_not_flying(host)  # again: that took seconds, in which a vehicle can be armed
-    # Last: after an installation that was interrupted, the next one sees the other version, and restarts.
-    for entry in changed:
-        if not dry_run and isinstance(entry, Link):
+    def write(written: Iterable[Entry]) -> None:
+        for entry in () if dry_run else written:
             entry.write()
-    do(_starting(host, instances, starts=starts, changed=bool(changed)))
+
+    of_service = [entry for entry in changed if isinstance(entry, Link) or entry.path.suffix == ".service"]
+    write(entry for entry in changed if entry not in of_service)
+    do([*_preparing(host), *_freeing(host, settings, say)])
+    enabling = [host.systemctl("enable", unit) for unit in own]
+    if not is_new:
+        do(enabling)
+    if restarted and not dry_run and not force:
+        _check_again(host, restarted, of_service)
+    write(of_service)
+    if of_service or any(state.get("NeedDaemonReload") == "yes" for state in states.values()):
+        do([host.systemctl("daemon-reload")])
+    if is_new:  # it could not be enabled before; no process of it is stopped
+        do(enabling)
+    do(_starting(host, own, restarted))
     if host.user:
         for line in _advice_of_user(host):
             say(line)
@@ -98,10 +109,34 @@ def install(host: Host, say: Say, *, dry_run: bool = False, force: bool = False)
         say("nothing was changed: --dry-run")
         return True
     up = True
-    for unit in watched:
-        replaced = before[unit] if changed else None
+    for unit in (*own, *(unit for unit in restarted if unit not in own)):
+        replaced = states[unit].get("InvocationID") if unit in restarted else None
         up = wait_until_up(host, unit, _settings_of(host, unit), say, replaced, began_s) and up
     return up
+
+
+def _is_outdated(state: Mapping[str, str], entries: Iterable[Entry]) -> bool:
+    """Whether a unit's process is older than the files, which are all there, or its loaded unit is.
+
+    There is no tolerance: a process starts within a second after its files were written, and the next
+    `install` is not to restart it.
+    """
+    started_us = int(state.get("ExecMainStartTimestampMonotonic") or 0)  # of CLOCK_MONOTONIC
+    if state.get("ActiveState") not in UP_OR_STARTING or not started_us:
+        return False
+    started_s = started_us / 1e6 + time.time() - time.monotonic()
+    written_s = max(entry.path.lstat().st_mtime for entry in entries)
+    return state.get("NeedDaemonReload") == "yes" or written_s > started_s
+
+
+def _check_again(host: Host, restarted: Sequence[str], unwritten: Sequence[Entry]) -> None:
+    """Raise SetupError if a vehicle was armed in the seconds since the first check."""
+    try:
+        check_not_flying(host)
+    except SetupError as error:
+        left = [str(entry.path) for entry in unwritten]
+        changed = f"not changed: {', '.join(left)}; " if left else ""
+        raise SetupError(f"{error}\n{changed}not restarted: {', '.join(restarted)}") from error
 
 
 def _settings_of(host: Host, unit: str) -> Settings | None:
@@ -173,7 +208,6 @@ def _preparing(host: Host) -> Iterator[tuple[str, ...]]:
         if below(host.root, Path("/run/udev/control")).exists():  # not in a container
             yield ("udevadm", "control", "--reload")
             yield ("udevadm", "trigger", "--subsystem-match=usb", "--subsystem-match=tty")
-    yield host.systemctl("daemon-reload")
 
 
 def _freeing(host: Host, settings: Settings | None, say: Say) -> Iterator[tuple[str, ...]]:
@@ -214,15 +248,12 @@ def terminals(host: Host, settings: Settings) -> list[str]:
     return [f"serial-getty@{device.name}.service", *jetson]
 
 
-def _starting(
-    host: Host, instances: Sequence[str], *, starts: bool, changed: bool
-) -> Iterator[tuple[str, ...]]:
-    if starts:
-        yield host.systemctl("enable", UNIT)
-        # A start may take minutes, for a model that is converted: it is watched.
-        yield host.systemctl("--no-block", "restart" if changed else "start", UNIT)
-    if instances and changed:
-        yield host.systemctl("--no-block", "try-restart", *instances)
+def _starting(host: Host, own: Sequence[str], restarted: Sequence[str]) -> Iterator[tuple[str, ...]]:
+    # A start may take minutes, for a model that is converted: it is watched.
+    if restarted:
+        yield host.systemctl("--no-block", "restart", *restarted)
+    if started := [unit for unit in own if unit not in restarted]:
+        yield host.systemctl("--no-block", "start", *started)
 
 
 def _advice_of_user(host: Host) -> Iterator[str]:

@@ -90,6 +90,7 @@ class Host:
         names = (
             *("ActiveState", "SubState", "UnitFileState", "NRestarts", "StatusText", "InvocationID"),
             *("ExecMainCode", "ExecMainStatus", "Result"),
+            *("ExecMainStartTimestampMonotonic", "NeedDaemonReload"),
         )
         printed = self.run(self.systemctl("show", unit, f"--property={','.join(names)}"))
         return dict(line.split("=", 1) for line in printed.splitlines() if "=" in line)

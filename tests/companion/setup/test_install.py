@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -67,16 +69,26 @@ class Computer:
 
     def _run(self, command: Sequence[str]) -> str:
         words = tuple(command)
-        if words[0] == self.failing:
-            raise SetupError(words[0])
+        if self.failing in (words[0], words[-1]):
+            raise SetupError(self.failing)
         if words[1] == "show":
             return self.states.get(words[2], "ActiveState=inactive")
+        if words[1:3] == ("--user", "show"):
+            return self.states.get(f"--user {words[3]}", "ActiveState=inactive")
         if words[1] != "list-units":
             self.commands.append(words)
         return ""
 
     def install(self, **options: bool) -> None:
         install.install(self.host, self.said.append, **options)
+
+    def install_for_user(self) -> None:
+        install.install(Host(user=True, root=self.root, run=self._run), self.said.append)
+
+    def runs(self, unit: str, age_s: float, state: str = "ActiveState=active") -> None:
+        """Have a unit whose process was started some time ago."""
+        started_us = (time.monotonic() - age_s) * 1e6
+        self.states[unit] = f"{state}\nExecMainStartTimestampMonotonic={started_us:.0f}\nInvocationID=former"
 
     def uninstall(self, **options: bool) -> None:
         uninstall.uninstall(self.host, self.said.append, **options)
@@ -120,6 +132,116 @@ def test_second_install_writes_and_restarts_nothing(computer: Computer) -> None:
     assert computer.files() == before
     assert computer.ran("systemctl", "--no-block", "start", UNIT)
     assert not any("restart" in words for words in computer.commands)
+    assert not any("daemon-reload" in words for words in computer.commands)
+
+
+@pytest.fixture
+def disarmed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(flight, "find_service", lambda *_: Found(service({"vehicle.armed": False})))
+
+
+@pytest.fixture
+def waited(monkeypatch: pytest.MonkeyPatch) -> dict[str, str | None]:
+    """The units that are waited for, each with the InvocationID that is replaced."""
+    found: dict[str, str | None] = {}
+
+    def wait(_: Host, unit: str, __: object, ___: object, replaced: str | None, _s: float) -> bool:
+        found[unit] = replaced
+        return True
+
+    monkeypatch.setattr(install, "wait_until_up", wait)
+    return found
+
+
+@pytest.mark.usefixtures("disarmed")
+@pytest.mark.parametrize(("age_s", "restarts"), [(100.0, True), (-0.05, False)])
+@pytest.mark.parametrize("name", [f"etc/systemd/system/{UNIT}", "opt/companion/current"])
+def test_process_older_than_the_files_is_replaced(
+    computer: Computer, waited: dict[str, str | None], name: str, age_s: float, restarts: bool
+) -> None:
+    computer.install()
+    for path in computer.files():
+        os.utime(path, (0, 0), follow_symlinks=False)
+    os.utime(computer.root / name, follow_symlinks=False)
+    computer.runs(UNIT, age_s)
+    computer.commands.clear()
+    computer.install()
+    assert computer.ran("systemctl", "--no-block", "restart", UNIT) is restarts
+    assert computer.ran("systemctl", "--no-block", "start", UNIT) is not restarts
+    assert waited == {UNIT: "former" if restarts else None}
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_unit_that_was_not_loaded_after_its_change_is_restarted(computer: Computer) -> None:
+    computer.install()
+    computer.runs(UNIT, -1.0, "ActiveState=active\nNeedDaemonReload=yes")
+    computer.commands.clear()
+    computer.install()
+    assert computer.commands[-2:] == [
+        ("systemctl", "daemon-reload"),
+        ("systemctl", "--no-block", "restart", UNIT),
+    ]
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_interrupted_update_of_a_user_is_completed(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, waited: dict[str, str | None]
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "own"))
+    computer.install_for_user()
+    computer.runs(f"--user {UNIT}", 1.0)
+    monkeypatch.setattr(sys, "executable", "/opt/other/bin/python3")
+    computer.failing = "daemon-reload"
+    with pytest.raises(SetupError):
+        computer.install_for_user()
+    computer.failing = ""
+    computer.commands.clear()
+    waited.clear()
+    computer.install_for_user()
+    assert computer.ran("systemctl", "--user", "--no-block", "restart", UNIT)
+    assert waited == {UNIT: "former"}
+
+
+def test_vehicle_of_a_user_that_is_armed_meanwhile_is_not_left(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "own"))
+    computer.install_for_user()
+    unit = tmp_path / "own/systemd/user" / UNIT
+    before = unit.read_text()
+    computer.runs(f"--user {UNIT}", 1.0)
+    computer.commands.clear()
+    monkeypatch.setattr(
+        flight, "find_service", lambda *_: Found(service({"vehicle.armed": bool(computer.commands)}))
+    )
+    monkeypatch.setattr(sys, "executable", "/opt/other/bin/python3")
+    monkeypatch.setattr(Host, "check_manager", lambda _: None)
+    with pytest.raises(SetupError) as raised:
+        computer.install_for_user()
+    assert f"not changed: {unit}" in str(raised.value)
+    assert unit.read_text() == before
+
+
+def test_nothing_but_a_reload_lies_between_check_and_restart(
+    computer: Computer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computer.install()
+    computer.version(NEW)
+    (computer.root / SYSTEM_UNITS.relative_to("/") / UNIT).write_text("[Unit]\n")
+    computer.runs(UNIT, 1.0)
+    checked: list[int] = []
+
+    def find(*_: object) -> Found:
+        checked.append(len(computer.commands))
+        return Found(service({"vehicle.armed": False}))
+
+    monkeypatch.setattr(flight, "find_service", find)
+    computer.install()
+    assert computer.commands[checked[-1] :] == [
+        ("systemctl", "daemon-reload"),
+        ("systemctl", "--no-block", "restart", UNIT),
+    ]
+    assert ("systemctl", "enable", UNIT) in computer.commands[checked[0] : checked[-1]]
 
 
 def test_update_after_an_interrupted_one_restarts(computer: Computer) -> None:
@@ -194,11 +316,15 @@ def test_vehicle_that_is_armed_meanwhile_is_not_left(
     computer.states[UNIT] = "ActiveState=active"
 
     def find(*_: object) -> Found:
-        return Found(service({"vehicle.armed": ("systemctl", "daemon-reload") in computer.commands}))
+        return Found(service({"vehicle.armed": ("systemctl", "enable", UNIT) in computer.commands}))
 
     monkeypatch.setattr(flight, "find_service", find)
-    with pytest.raises(SetupError, match="--force"):
+    unit = computer.root / SYSTEM_UNITS.relative_to("/") / UNIT
+    unit.write_text("[Unit]\n")
+    with pytest.raises(SetupError, match="--force") as raised:
         computer.install()
+    assert all(str(path) in str(raised.value) for path in (unit, computer.root / CURRENT.relative_to("/")))
+    assert unit.read_text() == "[Unit]\n"
     assert not any("restart" in words for words in computer.commands)
     assert (computer.root / CURRENT.relative_to("/")).readlink() == OLD
 
@@ -212,6 +338,22 @@ def test_silent_service_is_not_taken_for_disarmed(
     for act in (computer.install, computer.uninstall):
         with pytest.raises(SetupError, match="--force"):
             act()
+
+
+@pytest.mark.usefixtures("disarmed")
+def test_instance_that_is_starting_is_restarted_too(
+    computer: Computer, waited: dict[str, str | None]
+) -> None:
+    (wants := computer.root / "etc/systemd/system/multi-user.target.wants").mkdir(parents=True)
+    for name in ("east", "north", "south"):
+        (wants / f"companion@{name}.service").touch()
+        (computer.root / f"etc/companion/{name}.toml").touch()
+    computer.runs("companion@north.service", 1.0, "ActiveState=activating")
+    computer.runs("companion@south.service", 1.0, "ActiveState=active")
+    computer.install()
+    units = ("companion@north.service", "companion@south.service")
+    assert computer.ran("systemctl", "--no-block", "restart", *units)
+    assert waited == dict.fromkeys(units, "former")
 
 
 @pytest.mark.parametrize(
