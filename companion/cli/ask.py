@@ -19,6 +19,7 @@ from companion.cli.flags import (
     plain_errors,
     say_vehicle,
 )
+from companion.operator.reply_text import printable
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -115,9 +116,9 @@ class Terminal:
         self._busy_shown_s = -math.inf
 
     def write(self, text: str) -> None:
-        """A piece of an answer."""
+        """A piece of an answer. A model or a label could send control characters to the terminal."""
         self._in_line = not text.endswith("\n")
-        print(_printable(text), end="", flush=True)
+        print(printable(text, "\n"), end="", flush=True)
 
     def show(self, line: str) -> None:
         """A whole line; an empty one only ends the line before."""
@@ -125,7 +126,7 @@ class Terminal:
             print(flush=True)
         self._in_line = False
         if line:
-            print(_printable(line), flush=True)
+            print(printable(line, "\n"), flush=True)
 
     async def confirm(self) -> bool:
         """Ask whether to fly what was shown."""
@@ -239,11 +240,6 @@ class Terminal:
                 return
 
         threading.Thread(target=read, name="standard input", daemon=True).start()
-
-
-def _printable(text: str) -> str:
-    """Without control characters, which a model or a label could send to the terminal."""
-    return "".join(character for character in text if character.isprintable() or character == "\n")
 
 
 async def _cancelled(task: asyncio.Future[Any] | None) -> None:

@@ -22,6 +22,7 @@ from companion.cli.former import former_line
 from companion.host.journal import marked_for_journal
 from companion.host.load import with_load
 from companion.host.passing import EXIT_PASSING, PassingError
+from companion.operator.reply_text import printable
 from vision.extras import missing_module
 from vision.gc_pause import gc_paused
 from vision.redaction import redacted
@@ -211,7 +212,7 @@ def plain_errors(*expected: type[Exception], code: int = EXIT_BAD_INPUT) -> Iter
         yield
     except printed as error:
         for line in str(error).splitlines():
-            typer.echo(with_load(redacted(f"companion: {line}")), err=True)
+            typer.echo(with_load(redacted(f"companion: {printable(line)}")), err=True)
         raise typer.Exit(EXIT_PASSING if isinstance(error, PassingError) else code) from error
 
 
@@ -242,7 +243,7 @@ def check_belonging(context: typer.Context, what: str, names: Iterable[str], *, 
 
 def say_silent(text: str) -> None:
     """Print what is known of a service that is silent in the middle of a command; the command waits on."""
-    typer.echo(f"companion: {text}", err=True)
+    typer.echo(f"companion: {printable(text)}", err=True)
 
 
 def named_vehicle(settings: Settings) -> str | None:

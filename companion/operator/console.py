@@ -131,14 +131,14 @@ class Console:
             if word == "set":
                 return Answer("\n".join(await _set(target, rest)))
             reply = await target.command(text)
+            return Answer(f"{line}: {reply_text(reply)}", 0 if reply["success"] else _FAILED)
         except OSError as error:
             return Answer(str(error), _WRONG)
         except (ValueError, RuntimeError) as error:
             return Answer(f"{line}: {error}", _WRONG if isinstance(error, ValueError) else _FAILED)
         except Exception as error:
-            logger.exception("command %r failed", text)
-            reply = {"success": False, "reason": f"{type(error).__name__}: {error}"}
-        return Answer(f"{line}: {reply_text(reply)}", 0 if reply["success"] else _FAILED)
+            logger.exception("line %r failed", line)
+            return Answer(f"{line}: failed: {type(error).__name__}: {error}", _FAILED)
 
     async def completions(
         self, before: str, recent: Callable[[], Awaitable[list[str]]]

@@ -14,7 +14,11 @@ def printable(text: str, kept: str = "") -> str:
 
 
 def reply_text(reply: Mapping[str, Any]) -> str:
-    """`done: REASON`, `failed: REASON`, or `accepted, in progress`. reply: `success`, `reason`, `state`."""
+    """`done: REASON`, `failed: REASON`, or `accepted, in progress`; `printable` but for the ends of lines.
+
+    reply: `success`, `reason`, `state`.
+    """
+    reason = printable(reply["reason"], "\n")
     if reply.get("state") == "in_progress":
-        return f"accepted, {reply['reason']}"
-    return f"{'done' if reply['success'] else 'failed'}: {reply['reason']}"
+        return f"accepted, {reason}"
+    return f"{'done' if reply['success'] else 'failed'}: {reason}"

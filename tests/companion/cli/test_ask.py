@@ -323,7 +323,7 @@ def test_control_characters_do_not_reach_the_terminal(capsys: pytest.CaptureFixt
     terminal = Terminal()
     terminal.write("\x1b[2Jred\x07 car")
     terminal.show("\x1b]0;title\x07done")
-    assert capsys.readouterr().out == "[2Jred car\n]0;titledone\n"
+    assert capsys.readouterr().out == "?[2Jred? car\n?]0;title?done\n"
 
 
 def test_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -193,6 +193,18 @@ async def test_control_characters_of_an_answer_do_not_reach_the_terminal() -> No
     assert "\n" in (await Console({"": target}).answer("help")).text
 
 
+@pytest.mark.parametrize("reply", [{}, {"success": True}, {"reason": "done"}, {"success": True, "reason": 3}])
+async def test_reply_of_another_version_is_a_failure(reply: dict[str, Any]) -> None:
+    async def command(text: str) -> Mapping[str, Any]:
+        return reply
+
+    service = Service().target
+    target = Target(command, service.settings, service.status, service.commands)
+    answer = await Console({"": target}).answer("takeoff")
+    assert answer.code == 1
+    assert answer.text.startswith("takeoff: failed: ")
+
+
 async def test_values_are_set_together_and_may_be_quoted() -> None:
     service = Service()
     line = 'set guidance.max_altitude_m=20 detector.classes="traffic light,car"'
