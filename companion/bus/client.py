@@ -327,7 +327,7 @@ def _answer(
                 continue
             item = None
         if isinstance(item, zenoh.Reply) and item.ok is not None:
-            return parse_object(copy_payload(item.ok.payload, LARGEST_JSON_BYTES))
+            return _checked(parse_object(copy_payload(item.ok.payload, LARGEST_JSON_BYTES)), text)
         soon_s = time.monotonic() + _LAST_ANSWER_S
         if _is(item, zenoh.SampleKind.DELETE):
             until_s, gone = soon_s, True  # an answer may have been sent just before
@@ -346,6 +346,17 @@ def _answer(
             )
         elif item is None:
             raise NoAnswerError(f"{text!r}: {status.gone_text('its answer')}")
+
+
+def _checked(reply: dict[str, Any], text: str) -> dict[str, Any]:
+    """Return a reply with `success` and `reason`. Raises PeerDataError: another version's, without them."""
+    for key, kind in (("success", bool), ("reason", str)):
+        if not isinstance(reply.get(key), kind):
+            raise PeerDataError(
+                f"{text!r}: the service's answer cannot be used: expected {key}: {kind.__name__}, got "
+                f"{reply.get(key)!r:.80}; are both programs of the same version?"
+            )
+    return reply
 
 
 def _is(item: zenoh.Sample | zenoh.Reply | None, kind: zenoh.SampleKind) -> bool:
