@@ -168,7 +168,6 @@ AWAITED_TASKS = {
     "companion/cli/ask.py",
     "companion/cli/console.py",
     "companion/cli/run.py",
-    "companion/client/attached.py",
     "companion/dashboard/chat.py",
     "companion/ground_station/__main__.py",
     "companion/simulation/demo.py",

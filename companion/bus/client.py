@@ -14,6 +14,7 @@ import zenoh
 from pydantic import ValidationError
 from zenoh import ext
 
+from companion.bus.command_order import CommandOrder, Turn
 from companion.bus.config import read_config_file
 from companion.bus.connection_fault import connection_fault
 from companion.bus.session import zenoh_config
@@ -37,6 +38,8 @@ _DISCOVERY_S = 2.0
 _LAST_ANSWER_S = 0.3
 # `status` comes once a second. A service without it this long does not answer.
 SILENT_S = 4.0
+# Of a command in the answer to it.
+_LONGEST_SHOWN = 200
 
 logger = logging.getLogger(__name__)
 
@@ -226,10 +229,6 @@ class LastStatus:
             self._newest = str(status["vehicle"]["without_service"]), time.monotonic()
 
 
-def _nothing() -> None:
-    """Do nothing."""
-
-
 def send_command(
     session: zenoh.Session,
     vehicle: str,
@@ -237,40 +236,47 @@ def send_command(
     *,
     timeout_s: float = 120.0,
     on_silent: Callable[[str], None] = logger.warning,
-    on_sent: Callable[[], object] = _nothing,
+    turn: Turn | None = None,
 ) -> dict[str, Any]:
     """Send one command and wait for its result: {"success": bool, "reason": str, ...}.
 
     Args:
         on_silent: called once, with a sentence, if the service is there and silent meanwhile.
-        on_sent: called once the command is sent: what is sent by this session from now on arrives after it.
+        turn: when it is sent, of a program that may send several at once: of its `CommandOrder`, taken in the
+            order of the commands, not in the threads that call this. It ends once the command is sent or
+            cannot be. A command that must not be sent any more, such as one before a `stop`, is answered here
+            without success.
 
     Raises:
         NoAnswerError: no service for this vehicle, it has gone meanwhile, or no answer within `timeout_s`.
         PeerDataError: the answer cannot be used.
     """
-    received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
-    status = LastStatus(session, vehicle)
-    # The service's liveliness token shows whether it is there (it may arrive shortly after connecting), and
-    # when it has gone: a query to a killed service stays pending until its timeout.
-    watching = session.liveliness().declare_subscriber(alive_key(vehicle), received.put, history=True)
-    try:
+    with CommandOrder().turn(vehicle, text) if turn is None else turn as own_turn:
+        received: queue.SimpleQueue[zenoh.Sample | zenoh.Reply | None] = queue.SimpleQueue()
+        status = LastStatus(session, vehicle)
+        # The service's liveliness token shows whether it is there (it may arrive shortly after connecting),
+        # and when it has gone: a query to a killed service stays pending until its timeout.
+        watching = session.liveliness().declare_subscriber(alive_key(vehicle), received.put, history=True)
         try:
-            while not _is(received.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
-                pass
-        except queue.Empty:
-            raise _no_service(vehicle) from None
-        # Sent once: a command without an answer may be in progress.
-        deadline_s = time.monotonic() + timeout_s
-        replies = zenoh.handlers.Callback(received.put, lambda: received.put(None))
-        # The service limits the rate of each sender.
-        sender = str(session.zid())
-        session.get(command_key(vehicle), replies, payload=text, attachment=sender, timeout=timeout_s)
-        on_sent()
-        return _answer(received, vehicle, text, timeout_s, deadline_s, status, on_silent)
-    finally:
-        status.close()
-        watching.undeclare()  # type: ignore[no-untyped-call]
+            try:
+                while not _is(received.get(timeout=_DISCOVERY_S), zenoh.SampleKind.PUT):
+                    pass
+            except queue.Empty:
+                raise _no_service(vehicle) from None
+            if (not_sent := own_turn.wait()) is not None:
+                first_line = text.strip().partition("\n")[0][:_LONGEST_SHOWN]
+                return {"command": first_line, "state": "ended", "success": False, "reason": not_sent}
+            # Sent once: a command without an answer may be in progress.
+            deadline_s = time.monotonic() + timeout_s
+            replies = zenoh.handlers.Callback(received.put, lambda: received.put(None))
+            # The service limits the rate of each sender.
+            sender = str(session.zid())
+            session.get(command_key(vehicle), replies, payload=text, attachment=sender, timeout=timeout_s)
+            own_turn.end()
+            return _answer(received, vehicle, text, timeout_s, deadline_s, status, on_silent)
+        finally:
+            status.close()
+            watching.undeclare()  # type: ignore[no-untyped-call]
 
 
 def set_settings(
@@ -279,19 +285,22 @@ def set_settings(
     values: dict[str, Any] | None = None,
     *,
     timeout_s: float = 5.0,
-    on_sent: Callable[[], object] = _nothing,
+    turn: Turn | None = None,
 ) -> dict[str, Any]:
     """Change settings of a running service, all or none; returns key → `LiveSettingBody` of all that can be.
 
     Args:
-        values: key → value; None: change none. on_sent: as of `send_command`.
+        values: key → value; None: change none. turn: as of `send_command`.
 
     Raises:
-        SettingsRefusedError: by the service. NoAnswerError: no answer. PeerDataError: it cannot be used.
+        SettingsRefusedError: by the service. NoAnswerError: no answer, or not sent. PeerDataError: it cannot
+        be used.
     """
     payload = None if values is None else json.dumps(values)
-    replies = session.get(settings_key(vehicle), payload=payload, timeout=timeout_s)
-    on_sent()
+    with CommandOrder().turn(vehicle, None) if turn is None else turn as own_turn:
+        if (not_sent := own_turn.wait()) is not None:
+            raise NoAnswerError(f"settings of vehicle {vehicle!r}: {not_sent}")
+        replies = session.get(settings_key(vehicle), payload=payload, timeout=timeout_s)
     for reply in replies:
         if reply.ok is not None:
             return parse_object(copy_payload(reply.ok.payload, LARGEST_JSON_BYTES))

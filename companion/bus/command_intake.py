@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable
 
+from companion.bus.command_order import is_stop
 from companion.host.peer_data import Payload, PeerDataError, copy_payload
 
 LARGEST_COMMAND_BYTES = 160 * 1024
@@ -26,7 +27,6 @@ MAX_SENDERS = 32
 """Senders that are counted; of more, the one that was silent for the longest time is forgotten."""
 MAX_SENDER_BYTES = 64
 """Longer identifiers count as none."""
-SEPARATE_ALLOWANCE = b"stop"
 
 
 class CommandIntake:
@@ -56,7 +56,7 @@ class CommandIntake:
         except PeerDataError as error:
             return self._refuse(str(error))
         with self._lock:
-            allowance = self._stops if data.strip().lower() == SEPARATE_ALLOWANCE else self._others
+            allowance = self._stops if is_stop(data.decode(errors="replace")) else self._others
             accepted = allowance.take(sender)
         if not accepted:
             return self._refuse(f"more than {COMMANDS_PER_S:g} commands a second; send it again later")

@@ -24,6 +24,7 @@ from companion.bus.client import (
     set_settings,
     subscribe_kept,
 )
+from companion.bus.command_order import CommandOrder, Turn
 from companion.host.peer_data import PeerDataError, copy_payload, parse_object
 from companion.host.tasks import spawn
 from companion.operator.console import Target
@@ -68,42 +69,34 @@ async def in_thread(function: Callable[[], T]) -> T:
 
 
 def attached_target(session: zenoh.Session, vehicle: str, say: Callable[[str], None]) -> Target:
-    """Return how a console reaches a service. Commands and settings are sent in the order of their calls.
+    """Return how a console reaches a service. Commands and settings are sent in the order of their calls,
+    `stop` at once (`CommandOrder`).
 
     Args:
         say: gets a sentence, from any thread, if the service is silent while a command waits.
     """
-    order = asyncio.Lock()  # first in, first out
+    order = CommandOrder()
 
-    async def in_order(send: Callable[[Callable[[], None]], T]) -> T:
-        """Send after what was called before was sent: of two lines that come at once, the last one counts."""
-        loop, sent = asyncio.get_running_loop(), asyncio.Event()
-
-        def on_sent() -> None:
-            with suppress(RuntimeError):  # the loop is closed
-                loop.call_soon_threadsafe(sent.set)
-
-        async with order:
-            answer = asyncio.ensure_future(in_thread(lambda: send(on_sent)))
-            answer.add_done_callback(lambda _: sent.set())
-            try:
-                await sent.wait()
-            except asyncio.CancelledError:
-                answer.cancel()
-                raise
-        return await answer
+    async def in_turn(text: str | None, send: Callable[[Turn], T]) -> T:
+        turn = order.turn(vehicle, text)
+        try:
+            return await in_thread(lambda: send(turn))
+        except asyncio.CancelledError:
+            turn.withdraw()
+            raise
 
     async def command(text: str) -> Mapping[str, Any]:
-        return await in_order(
-            lambda on_sent: send_command(
-                session, vehicle, text, timeout_s=_COMMAND_TIMEOUT_S, on_silent=say, on_sent=on_sent
-            )
+        return await in_turn(
+            text,
+            lambda turn: send_command(
+                session, vehicle, text, timeout_s=_COMMAND_TIMEOUT_S, on_silent=say, turn=turn
+            ),
         )
 
     async def settings(payload: bytes) -> Mapping[str, Any]:
         values = parse_object(payload) if payload else None
-        return await in_order(
-            lambda on_sent: set_settings(session, vehicle, values, timeout_s=_QUERY_S, on_sent=on_sent)
+        return await in_turn(
+            None, lambda turn: set_settings(session, vehicle, values, timeout_s=_QUERY_S, turn=turn)
         )
 
     def query(path: str) -> dict[str, Any]:

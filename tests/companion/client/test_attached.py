@@ -16,7 +16,7 @@ pytestmark = pytest.mark.realtime
 
 async def test_lines_that_come_at_once_arrive_in_their_order() -> None:
     # As of a text with newlines that is pasted, or of keys that a slow network delivers together.
-    lines = [f"goto {number} 0" for number in range(8)] + ["stop"]
+    lines = [f"goto {number} 0" for number in range(8)]
     with services("hawk") as (endpoint, received):
         section = client_settings(ZenohSection(connect=(endpoint,), multicast_scouting=False))
         with open_client(section, timeout_s=10.0) as session:
@@ -25,3 +25,7 @@ async def test_lines_that_come_at_once_arrive_in_their_order() -> None:
                 received.clear()
                 await asyncio.gather(*map(target.command, lines))
                 assert [text for _, text in received] == lines
+                received.clear()
+                replies = await asyncio.gather(*map(target.command, [*lines, "stop"]))
+                sent = [text for text, reply in zip(lines, replies, strict=False) if reply["success"]]
+                assert [text for _, text in received] == [*sent, "stop"]
