@@ -27,6 +27,7 @@ from companion.bus.client import (
     open_client,
     send_command,
 )
+from companion.bus.command_order import CommandOrder
 from companion.client.commands import NON_FLIGHT, Commands, Reply
 from companion.client.endings import Endings
 from companion.client.stream import Stream
@@ -114,7 +115,9 @@ class Drone(Commands):
     """One vehicle. Its commands wait until they have ended; an endless one until the vehicle flies it, and
     `ended` waits for its end.
 
-    Cancelling a waiting command sends `stop`. A command that is refused or fails raises CommandFailedError.
+    Commands are sent in the order of their calls. `stop` is sent at once; those before it that are not yet
+    sent then fail. Cancelling a waiting command sends `stop`. A command that is refused or fails raises
+    CommandFailedError.
 
     Attributes:
         name: `vehicle.name` of its service.
@@ -122,6 +125,7 @@ class Drone(Commands):
 
     def __init__(self, session: zenoh.Session, name: str) -> None:
         self._session, self.name = session, name
+        self._order = CommandOrder()
         # One for all its steering: the last message of the one before is still valid at the next.
         self._source = f"client-{uuid.uuid4().hex[:8]}"
         self._steering: Steering | None = None
@@ -134,7 +138,9 @@ class Drone(Commands):
 
     def other(self, name: str) -> Drone:
         """Another vehicle on the same connection."""
-        return Drone(self._session, name)
+        drone = Drone(self._session, name)
+        drone._order = self._order
+        return drone
 
     async def vehicles(self) -> list[str]:
         """The names of all vehicles whose service runs."""
@@ -192,6 +198,7 @@ class Drone(Commands):
     def _send(self, text: str, timeout_s: float) -> asyncio.Future[Reply]:
         """Send a command from a thread of its own: a pool would let endless ones delay a `stop`."""
         self._watched()
+        turn = self._order.turn(self.name, text)
         loop = asyncio.get_running_loop()
         outcome: asyncio.Future[Reply] = loop.create_future()
         outcome.add_done_callback(lambda done: done.cancelled() or done.exception())  # it may not be awaited
@@ -206,7 +213,7 @@ class Drone(Commands):
             reply: Reply | None = None
             failure: Exception | None = None
             try:
-                reply = send_command(self._session, self.name, text, timeout_s=timeout_s)
+                reply = send_command(self._session, self.name, text, timeout_s=timeout_s, turn=turn)
             except (NoAnswerError, ValueError, zenoh.ZError) as error:
                 failure = error
             with suppress(RuntimeError):  # the loop is closed

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from companion.bus.client import NoAnswerError
+from companion.bus.command_order import CommandOrder
 from companion.client import Drone
 from companion.client.commands import Reply
 from companion.dashboard.fleet import Fleet
@@ -302,7 +303,7 @@ class Chats:
         check_words("language.may", self._language.may)
         endpoint = await asyncio.to_thread(endpoint_from, self._language)
         async with self._beginning:
-            drone = _ChatDrone(session, chat.vehicle, lambda: self._before_command(chat))
+            drone = _ChatDrone(session, chat.vehicle, self._fleet.order, lambda: self._before_command(chat))
             converse = await conversations(drone, endpoint, self._language.may)
         operator = Operator(
             lambda piece: chat.current.write(piece), lambda line: chat.current.show(line), chat.confirm
@@ -316,11 +317,18 @@ class Chats:
 
 
 class _ChatDrone(Drone):
-    """A chat's vehicle. `before_command`: called before each; raises CancelledError after a stop."""
+    """A chat's vehicle.
 
-    def __init__(self, session: zenoh.Session, name: str, before_command: Callable[[], None]) -> None:
+    Args:
+        order: of the page's commands too, so that its `stop` is the last one.
+        before_command: called before each; raises CancelledError after a stop.
+    """
+
+    def __init__(
+        self, session: zenoh.Session, name: str, order: CommandOrder, before_command: Callable[[], None]
+    ) -> None:
         super().__init__(session, name)
-        self._before_command = before_command
+        self._order, self._before_command = order, before_command
 
     async def command(self, text: str) -> Reply:
         """As the client's. Cancelled by a stop, it sends one of its own only if that stop does not end it."""

@@ -16,6 +16,7 @@ import zenoh
 
 from companion.bus.bodies.vehicle import VelocityBody
 from companion.bus.client import NoAnswerError, no_node_text, send_command
+from companion.bus.command_order import CommandOrder, is_stop
 from companion.bus.connection_fault import connection_fault
 from companion.bus.session import encode, zenoh_config
 from companion.bus.topics import VELOCITY, alive_key
@@ -39,6 +40,9 @@ class Fleet:
     Args:
         settings: of a zenoh client.
         vehicle: name of the vehicle that is shown first.
+
+    Attributes:
+        order: of all commands that are sent by this session.
     """
 
     def __init__(self, settings: ZenohSection, vehicle: str) -> None:
@@ -52,6 +56,7 @@ class Fleet:
         self._replies: deque[tuple[int, dict[str, Any]]] = deque(maxlen=_KEPT_REPLIES)
         self._number = 0
         self._waiting: Counter[tuple[str, bool]] = Counter()  # by vehicle, and whether it is `stop`
+        self.order = CommandOrder()
         self._objects: list[SeenObject] = []
 
     @property
@@ -163,13 +168,17 @@ class Fleet:
         return self._number, [reply for number, reply in self._replies if number > after]
 
     def command(self, vehicle: str, text: str, identifier: str) -> asyncio.Future[dict[str, Any]] | None:
-        """Send a command; the outcome is also added to `replies`. None: too many are waiting."""
+        """Send a command; the outcome is also added to `replies`. None: too many are waiting.
+
+        A vehicle's commands are sent in the order of the calls, `stop` at once (`CommandOrder`).
+        """
         loop = self._link.loop
         assert loop is not None
-        stop = text.strip().lower() == "stop"
+        stop = is_stop(text)
         if self._waiting[vehicle, stop] >= MAX_COMMANDS:
             return None
         self._waiting[vehicle, stop] += 1
+        turn = self.order.turn(vehicle, text)
         outcome: asyncio.Future[dict[str, Any]] = loop.create_future()
         about = {"id": identifier, "command": text[:200], "vehicle": vehicle}
 
@@ -181,13 +190,13 @@ class Fleet:
             outcome.set_result(answer)
 
         def send() -> None:
+            timeout_s = _STOP_TIMEOUT_S if stop else _COMMAND_TIMEOUT_S
             try:
-                session = self._link.session
-                if session is None:
-                    raise NoAnswerError(self.problem)
-                reply = send_command(
-                    session, vehicle, text, timeout_s=_STOP_TIMEOUT_S if stop else _COMMAND_TIMEOUT_S
-                )
+                with turn:
+                    session = self._link.session
+                    if session is None:
+                        raise NoAnswerError(self.problem)
+                    reply = send_command(session, vehicle, text, timeout_s=timeout_s, turn=turn)
             except (NoAnswerError, ValueError, zenoh.ZError) as error:
                 reply = {"success": False, "reason": str(error).partition("\n")[0]}
             if not loop.is_closed():

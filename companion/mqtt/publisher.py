@@ -7,6 +7,7 @@ import json
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -25,6 +26,7 @@ from companion.bus.client import (
     send_command,
     subscribe_kept,
 )
+from companion.bus.command_order import CommandOrder, Turn, is_stop
 from companion.bus.topics import IMAGE, STATUS, TRACKS, VEHICLE, Topic
 from companion.host.peer_data import PeerDataError, parse_object
 from companion.host.tasks import error_text
@@ -35,7 +37,8 @@ from companion.mqtt.webhooks import Webhook
 from companion.settings.operator import MqttSection
 
 _TICK_S = 0.1
-_COMMAND_TIMEOUT_S = 3600.0
+_COMMAND_TIMEOUT_S, _STOP_TIMEOUT_S = 3600.0, 10.0
+# That wait for their outcome; `stop` has a separate allowance of the same size.
 _MOST_COMMANDS = 4
 
 
@@ -52,7 +55,8 @@ class _Publisher:
         self._webhooks = [Webhook(url, client.say) for url in section.webhooks]
         self._place: dict[str, Any] = {}
         self._status_s = -math.inf
-        self._commands = 0
+        self._commands: Counter[bool] = Counter()  # that wait for their outcome, by whether it is `stop`
+        self._order = CommandOrder()
         self._link: BrokerLink | None = None
         if section.url is None:
             client.say(f"{LISTENING}{len(self._webhooks)} webhooks")
@@ -167,18 +171,21 @@ class _Publisher:
             self._link.state(f"{self._base}/place", _json({name: place[key] for name, key in names.items()}))
 
     def _on_command(self, text: str) -> None:
-        if self._commands >= _MOST_COMMANDS:
+        stop = is_stop(text)
+        if self._commands[stop] >= _MOST_COMMANDS:
             self._answer(text, {"success": False, "reason": f"{_MOST_COMMANDS} commands are in progress"})
             return
-        self._commands += 1
+        self._commands[stop] += 1
+        turn = self._order.turn(self._vehicle, text)
         # Not of the loop's pool, whose end would wait for it.
-        Thread(target=self._execute, args=(text,), name="MQTT command", daemon=True).start()
+        Thread(target=self._execute, args=(text, turn), name="MQTT command", daemon=True).start()
 
-    def _execute(self, text: str) -> None:
+    def _execute(self, text: str, turn: Turn) -> None:
         """Runs in a thread of its own."""
+        timeout_s = _STOP_TIMEOUT_S if turn.is_stop else _COMMAND_TIMEOUT_S
         try:
             reply = send_command(
-                self._bus, self._vehicle, text, timeout_s=_COMMAND_TIMEOUT_S, on_silent=self._say
+                self._bus, self._vehicle, text, timeout_s=timeout_s, on_silent=self._say, turn=turn
             )
         except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
             reply = {"success": False, "reason": str(error)}
@@ -186,7 +193,7 @@ class _Publisher:
             self._loop.call_soon_threadsafe(self._on_reply, text, reply)
 
     def _on_reply(self, text: str, reply: dict[str, Any]) -> None:
-        self._commands -= 1
+        self._commands[is_stop(text)] -= 1
         self._answer(text, reply)
 
     def _answer(self, text: str, reply: dict[str, Any]) -> None:

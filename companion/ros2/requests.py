@@ -7,14 +7,15 @@ import math
 import re
 import secrets
 import time
+from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from threading import Lock, Thread
 from typing import Any
 
 import zenoh
 
 from companion.bus.client import NoAnswerError, send_command
+from companion.bus.command_order import CommandOrder, Turn, is_stop
 from companion.bus.topics import VELOCITY
 from companion.host.peer_data import PeerDataError
 from companion.ros2.cdr import decode, encode
@@ -28,9 +29,10 @@ _JUST_STARTED_NS, _REPETITION_NS = 5_000_000_000, 10_000_000_000
 _AGAIN = "the same text within 10 s is no new command; publish it --once"
 _REPEATED = "the same text again is no new request; publish an empty one before it"
 _SHOWN = 200  # characters of a command in its outcome
-# A mission takes so long.
-_TIMEOUT_S = 3600.0
-# A newer command ends the one before, so more than a few do not wait for their outcome at once.
+# A mission takes up to an hour.
+_TIMEOUT_S, _STOP_TIMEOUT_S = 3600.0, 10.0
+# A newer command ends the one before, so more than a few do not wait for their outcome at once. `stop` has a
+# separate allowance of the same size.
 _MOST_COMMANDS = 16
 _DISABLED = "ros2.commands is false: the settings must allow commands from ROS"
 
@@ -70,7 +72,8 @@ class Requests:
             priority=VELOCITY.priority,
             express=VELOCITY.express,
         )
-        self._lock, self._running = Lock(), 0
+        self._lock, self._order = Lock(), CommandOrder()
+        self._running: Counter[bool] = Counter()  # that wait for their outcome, by whether it is `stop`
         self._object: str | None = None  # the newest that was received
         self._started_ns = time.monotonic_ns()
         self._command, self._command_ns = "", 0  # the newest that was received, and when
@@ -127,14 +130,14 @@ class Requests:
         wanted = str(decode(type_name, payload)["data"]).strip()
         with self._lock:
             before, self._object = self._object, wanted
-            idle = self._running == 0
+            idle = self._running.total() == 0
         if not wanted:
             return
         first = before is None and received_ns - self._started_ns < _JUST_STARTED_NS
         if not _CLASS_NAME.fullmatch(wanted):
             self._answer(wanted, {"success": False, "reason": f"{name}: expected the name of a class"})
         elif not self._commands or (not first and wanted != before):
-            self._start(wanted, partial(self._execute, _mission(wanted), wanted))
+            self._start(_mission(wanted), wanted)
         elif idle:
             self._answer(wanted, {"success": False, "reason": f"{name}: {_REPEATED}"})
 
@@ -148,37 +151,41 @@ class Requests:
         with self._lock:
             again = text == self._command and received_ns - self._command_ns < _REPETITION_NS
             self._command, self._command_ns = text, received_ns
-            idle = self._running == 0
-        if not again or text.strip() == "stop" or not self._commands:
-            self._start(text, partial(self._execute, text, text))
+            idle = self._running.total() == 0
+        if not again or is_stop(text) or not self._commands:
+            self._start(text, text)
         elif idle:
             self._answer(text, {"success": False, "reason": f"{name}: {_AGAIN}"})
 
-    def _start(self, text: str, work: Callable[[], object]) -> None:
+    def _start(self, command: str, text: str) -> None:
+        """Send a command from a thread of its own; its outcome is published as that of `text`."""
+        stop = is_stop(command)
         with self._lock:
             refused = _DISABLED if not self._commands else ""
-            if self._running >= _MOST_COMMANDS:
+            if self._running[stop] >= _MOST_COMMANDS:
                 refused = f"{_MOST_COMMANDS} commands wait for their outcome"
             if not refused:
-                self._running += 1
+                self._running[stop] += 1
         if refused:
             self._answer(text, {"success": False, "reason": refused})
             return
+        turn = self._order.turn(self._vehicle, command)
 
         def run() -> None:
             try:
-                work()
+                self._execute(command, text, turn)
             finally:
                 with self._lock:
-                    self._running -= 1
+                    self._running[stop] -= 1
 
         Thread(target=run, name="ROS command", daemon=True).start()
 
-    def _execute(self, command: str, text: str) -> None:
+    def _execute(self, command: str, text: str, turn: Turn) -> None:
         """Send a command, and publish its outcome as that of `text`."""
+        timeout_s = _STOP_TIMEOUT_S if turn.is_stop else _TIMEOUT_S
         try:
             reply = send_command(
-                self._session, self._vehicle, command, timeout_s=_TIMEOUT_S, on_silent=self._say
+                self._session, self._vehicle, command, timeout_s=timeout_s, on_silent=self._say, turn=turn
             )
         except (NoAnswerError, PeerDataError, zenoh.ZError) as error:
             reply = {"success": False, "reason": str(error)}

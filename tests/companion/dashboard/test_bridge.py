@@ -287,6 +287,7 @@ async def test_stop_has_its_own_allowance_of_waiting_commands() -> None:
             waiting = [fleet.command(NAME, "hold", str(number)) for number in range(MAX_COMMANDS)]
             assert None not in waiting
             assert fleet.command(NAME, "hold", "more") is None
+            await until(lambda: len(queries) == MAX_COMMANDS, 30.0)
             stop = fleet.command(NAME, " STOP", "stop")
             assert stop is not None
             await until(lambda: len(queries) == MAX_COMMANDS + 1, 30.0)

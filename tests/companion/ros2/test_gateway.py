@@ -324,7 +324,7 @@ def test_repeated_object_does_not_take_the_vehicle_back(bus: BusSide, requests: 
     for second in (*range(10), *range(70, 80)):
         made.on_object("object_to_seek", STRING, text_of("car"), begin_ns + second * 10**9, 0)
         assert results.get(timeout=WAIT_S)["success"] is False
-        wait_until(lambda: made._running == 0)
+        wait_until(lambda: made._running.total() == 0)
     assert bus.received == 1
     made.on_object("object_to_seek", STRING, text_of(""), begin_ns, 0)  # the end of the repetition
     made.on_object("object_to_seek", STRING, text_of("car"), begin_ns, 0)
@@ -343,7 +343,7 @@ def test_repeated_command_is_one_command_but_stop_is_always_one(bus: BusSide, re
         for second in seconds:
             made.on_command("~/command", STRING, text_of(text), begin_ns + second * 10**9, 0)
             assert results.get(timeout=WAIT_S)["command"] == text
-            wait_until(lambda: made._running == 0)
+            wait_until(lambda: made._running.total() == 0)
         assert bus.received == commands
 
 
