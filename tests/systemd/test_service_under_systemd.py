@@ -106,6 +106,18 @@ def test_second_install_changes_nothing(installed: Container) -> None:
     assert not {"new", "changed"} & {line.split()[0] for line in output.splitlines() if line.strip()}
 
 
+def test_process_older_than_its_unit_is_replaced(installed: Container) -> None:
+    installed.run("touch", "/etc/systemd/system/companion.service")
+    processes = [installed.show("InvocationID")]
+    for _ in range(2):
+        output = installed.companion("install", environment=OLD)
+        assert not {"new", "changed"} & {line.split()[0] for line in output.splitlines() if line.strip()}
+        processes.append(installed.show("InvocationID"))
+    first, second, third = processes
+    assert first != second
+    assert second == third
+
+
 def test_dry_run_changes_nothing(empty: Container) -> None:
     before = tree(empty)
     output = empty.companion("install", "--dry-run", environment=OLD)
