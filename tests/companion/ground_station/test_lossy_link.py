@@ -130,6 +130,5 @@ async def test_a_third_lost_delays_by_seconds(filming: list[str], tmp_path: Path
         await until(lambda: network.active and network.heartbeat_s > killed_s)
         times_s["station before"] = await network.complete_s(network.heartbeat_s)
         await asyncio.to_thread(stack.close)
-    print({name: round(value, 2) for name, value in times_s.items()}, network.passed, network.lost)
     assert max(times_s.values()) < COMPLETE_S, times_s
     assert network.lost / (network.passed + network.lost) == pytest.approx(LOSS, abs=0.1)

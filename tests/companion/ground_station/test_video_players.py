@@ -242,7 +242,7 @@ async def test_h264_child_that_dies_or_hangs_is_replaced(
         await until(lambda: stream.server.is_ready)
         assert stream.child != first
         assert how is signal.SIGKILL or stream.pushes - pushes > RATE_HZ
-        assert stream.longest_push_s < 2.0  # it would wait for the child for good
+        assert stream.longest_push_s < 0.5
         assert "-9" in stream.said[-1]
         async with ffmpeg(stream.uri, "tcp") as player:
             await shown(player, 5, 6.0)

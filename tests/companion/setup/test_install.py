@@ -362,7 +362,7 @@ def test_instance_that_is_starting_is_restarted_too(
         ("/home/pi/venv", "/usr/bin/python3.11"),
         (str(INSTALLATIONS), "/usr/bin/python3.11"),
         (str(CURRENT), "/usr/bin/python3.11"),
-        (str(OLD), "/root/python/bin/python3.11"),
+        (str(OLD), "/home/pi/python/bin/python3.11"),
     ],
 )
 def test_environment_that_the_service_cannot_use_is_named(
